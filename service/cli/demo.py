@@ -32,6 +32,7 @@ from service.base.fields import Sun
 from service.base.progress import no_progress
 from service.base.settings import Settings
 from service.cli.demo_described import Demonstrated, write_southern_plant
+from service.cli.demo_field_store import seed_field
 from service.cli.demo_plant import write_plant
 from service.cli.field import FieldReport, FieldRequest, trace_field
 from service.cli.folder import observations_of, surface_errors, write_json
@@ -79,12 +80,18 @@ class HeliostatResult:
 
 
 def run_demos(
-    data: Path | None, plant: Path | None, out: Path, console: Console, quiet: bool = False
+    data: Path | None,
+    plant: Path | None,
+    out: Path,
+    console: Console,
+    quiet: bool = False,
+    has_field: bool = True,
 ) -> Mapping[str, object]:
-    """Run the demonstration on a folder, on photographs of a plant's file, or on two plants.
+    """Run the demonstration on a folder, on photographs of a plant's file, or on embedded plants.
 
     The embedded plants are one of Juelich's kind, in ``out``, and one of another, in
-    ``out/southern``. A plant of a file is demonstrated in a folder of its name.
+    ``out/southern``. With ``has_field`` a third one follows, to look at: a field with faults in
+    ``out/store-field``. A plant of a file is demonstrated in a folder of its name.
 
     Returns
     -------
@@ -104,6 +111,15 @@ def run_demos(
     with TemporaryDirectory(prefix="heliotwin-") as folder:
         file = write_southern_plant(Path(folder))
         other = _demonstrate(file, out, console, quiet)
+    if has_field:
+        store = out / "store-field"
+        with _bars(console, quiet) as bars:
+            task = bars.add_task("a field with faults", total=None)
+            seed_field(out / "plant-field", store, lambda name: bars.update(task, advance=1))
+        if not quiet:
+            _print_next(
+                console, "a field of 200 heliostats with faults, to look at its pages", store
+            )
     return {**report, "other_plant": other}
 
 
@@ -403,10 +419,17 @@ def _print(console: Console, results: list[HeliostatResult], out: Path, store: P
         table.add_row(*_row(result))
     console.print(table)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
-    # A person can paste the last line: it has the full path if the command is not on the PATH.
+    _print_next(console, "next, the service on what was made", store)
+
+
+def _print_next(console: Console, what: str, store: Path) -> None:
+    """Print a command that serves a store.
+
+    A person can paste the line: it has the full path if the command is not on the PATH.
+    """
     beside = str(Path(sys.executable).with_name("heliotwin"))
     command = "heliotwin" if shutil.which("heliotwin") else shlex.quote(beside)
-    console.print("next, the service on what was made:", highlight=False)
+    console.print(f"{what}:", highlight=False)
     said = f"HELIOTWIN_DATA_DIR={shlex.quote(str(store))} {command} serve"
     console.print(said, highlight=False, markup=False, soft_wrap=True)
 

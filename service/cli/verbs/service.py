@@ -165,12 +165,18 @@ def demo(
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/demo"),
+    field: Annotated[
+        bool,
+        typer.Option(help="Also fill a store of 200 heliostats with faults, to look at its pages."),
+    ] = True,
     as_json: AsJson = False,
 ) -> None:
     """Run the main job, with pictures and a report, on two embedded plants, a plant's file or a
     measurement folder.
+
+    After the embedded plants, a field with faults follows.
     """
     from service.cli.demo import run_demos
 
     require_folder(out)
-    show(run_demos(data, plant, out, console, quiet=as_json), as_json)
+    show(run_demos(data, plant, out, console, quiet=as_json, has_field=field), as_json)

@@ -1,0 +1,108 @@
+"""Fill the store of the demonstration's field by import, jobs and received photographs."""
+
+import shutil
+import threading
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from service.base.progress import Progress, no_progress
+from service.base.settings import Settings
+from service.cli.demo_field import (
+    ARCHIVED_DAYS,
+    FAULTS,
+    ROWS,
+    plan_photographs,
+    write_layout,
+    write_photographs,
+)
+from service.jobs.enqueuing import enqueue
+from service.jobs.kinds import KINDS
+from service.jobs.worker import Worker
+from service.sources.folder import MeasurementFolder, read_folder
+from service.twin.photographs.repeats import receive
+from service.twin.runtime.runtime import Runtime
+from service.twin.transfer.importing import import_folder
+
+ACTOR = "demo"
+"""Who the store says made its jobs and sent its photographs."""
+
+_THREADS = 2
+_EVERY = 4  # of the heliostats without a fault, every fourth has a surface
+
+
+def seed_field(
+    root: Path, store: Path, progress: Progress = no_progress, *, rows: int = ROWS
+) -> None:
+    """Write the field's folder ``root`` and fill the ``store``.
+
+    Older photographs are imported, and give surfaces and mounts. Newer ones are received one by
+    one, as by the service, so each is compared with its forecast. A store that exists is left as it
+    is.
+    """
+    if store.exists():
+        return
+    begun = store.with_name(f"{store.name}-unfinished")
+    for old in (root, begun):
+        shutil.rmtree(old, ignore_errors=True)
+    now = datetime.now(UTC)
+    begin = now - timedelta(days=ARCHIVED_DAYS)
+    plant = write_layout(root, rows)
+    photographs = plan_photographs(plant, now)
+    older = [one for one in photographs if one.taken_at < begin]
+    newer = [one for one in photographs if one.taken_at >= begin]
+    runtime = Runtime.from_settings(Settings(data_dir=begun, database_url=None, host="127.0.0.1"))
+    try:
+        runtime.database.upgrade()
+        import_folder(runtime, read_folder(root, [], whole_field=True), actor=ACTOR)
+        write_photographs(root, plant, older, progress)
+        names = sorted({one.mirror.name for one in older})
+        _in_threads(
+            lambda part: import_folder(runtime, read_folder(root, part), progress, ACTOR), names
+        )
+        faulty = {name for fault in FAULTS for name in fault.heliostats}
+        chosen = [name for place, name in enumerate(names) if name in faulty or not place % _EVERY]
+        _in_threads(lambda part: _run(runtime, "predictions", heliostats=part, images=8), chosen)
+        _run(runtime, "calibrations")
+        write_photographs(root, plant, newer, progress)
+        folder = read_folder(root, sorted({one.mirror.name for one in newer}))
+        sent = {str(one.number) for one in newer}
+        _in_threads(
+            lambda part: _receive(runtime, folder, part, sent, progress),
+            list(folder.plant.heliostats),
+        )
+    finally:
+        runtime.close()
+    begun.rename(store)
+
+
+def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> None:
+    """Work on parts of the names in threads, and raise what one of them raised."""
+    parts = [list(names[start::_THREADS]) for start in range(_THREADS)]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(work, filter(None, parts)))
+
+
+def _run(runtime: Runtime, name: str, **payload: Any) -> None:
+    """Queue a job, and run it."""
+    kind = KINDS[name]
+    enqueue(runtime, kind, kind.payload.model_validate(payload), ACTOR)
+    Worker(runtime, KINDS, ACTOR, threading.Event()).work()
+
+
+def _receive(
+    runtime: Runtime,
+    folder: MeasurementFolder,
+    names: Sequence[str],
+    sent: Collection[str],
+    progress: Progress,
+) -> None:
+    """Receive the ``sent`` photographs of heliostats, in the order of their numbers."""
+    for name in names:
+        for one in folder.measurements(name):
+            if one.identifier in sent:
+                progress(one.key)
+                (image,) = one.images.items()
+                receive(runtime, name, one.photograph(image[0]), image[1].read_bytes(), actor=ACTOR)

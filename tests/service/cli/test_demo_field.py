@@ -1,0 +1,72 @@
+"""The demonstration's field: each fault that it is made with is found."""
+
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+
+from service.cli.demo_field import FAULTS, Fault
+from service.cli.demo_field_store import seed_field
+from service.store.columns import now
+from service.store.tables import HeliostatRow, MeasurementRow
+from tests.conftest import made_once
+from tests.service.conftest import until
+from tests.service.real import client_on, runtime_of
+
+ROWS = 4
+"""Rows of heliostats: those with faults are in them."""
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A client on the store of a small field; it only reads."""
+    made = made_once(
+        tmp_path_factory,
+        "field",
+        lambda root: seed_field(root / "plant", root / "data", rows=ROWS),
+    )
+    with client_on(made) as client:
+        yield client
+
+
+def alerts_of(client: TestClient) -> list[dict[str, Any]]:
+    """All alerts, after the results behind them are computed."""
+    path = "/v1/attention?limit=500"
+    until(lambda: client.get(path).json()["pending"] == 0, "the field is computed")
+    items: list[dict[str, Any]] = client.get(path).json()["items"]
+    return items
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [f for f in FAULTS if f.alarm], ids=lambda fault: fault.kind)
+def test_faults_of_heliostats_raise_their_alarms(client: TestClient, fault: Fault):
+    found = {one["heliostat"] for one in alerts_of(client) if one["reason"] == fault.alarm}
+    assert found == set(fault.heliostats)
+
+
+@pytest.mark.slow
+def test_a_hazy_week_is_seen_in_all_accuracies_and_then_gone(client: TestClient):
+    (haze,) = (fault for fault in FAULTS if fault.kind == "hazy")
+    query = select(MeasurementRow.taken_at, MeasurementRow.forecast_accuracy).join(HeliostatRow)
+    query = query.where(MeasurementRow.forecast_accuracy.is_not(None))
+    with runtime_of(client).database.reading() as session:
+        dated = [row for row in session.execute(query) if row[0] is not None]
+    first, last = (now() - timedelta(days=days - 0.5) for days in haze.days)
+    during = median(accuracy for at, accuracy in dated if first < at < last)
+    before, after = (
+        median(accuracy for at, accuracy in dated if is_then(at))
+        for is_then in (lambda at: at < first, lambda at: at > last)
+    )
+    assert during < min(before, after) - 0.03
+
+
+def test_a_store_that_exists_stays(tmp_path: Path):
+    (tmp_path / "data").mkdir()
+    seed_field(tmp_path / "plant", tmp_path / "data")
+    assert not list((tmp_path / "data").iterdir())
+    assert not (tmp_path / "plant").exists()
