@@ -26,9 +26,7 @@ ROWS = 4
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A client on the store of a small field; it only reads."""
     made = made_once(
-        tmp_path_factory,
-        "field",
-        lambda root: seed_field(root / "plant", root / "data", rows=ROWS),
+        tmp_path_factory, "field", lambda root: seed_field(root / "plant", root / "data", rows=ROWS)
     )
     with client_on(made) as client:
         yield client
