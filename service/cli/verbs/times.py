@@ -1,22 +1,15 @@
 """The command ``heliotwin times``: add times to stored measurements."""
 
-import csv
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from model.errors import InvalidInputError
 from service.cli.output import AsJson
 from service.cli.store import actor, require_reason
 
-if TYPE_CHECKING:
-    from service.twin.photographs.corrections import GivenTime
-
 app = typer.Typer()
-
-_COLUMNS = ("heliostat", "id", "taken_at")
 
 
 @app.command()
@@ -33,11 +26,13 @@ def times(
 ) -> None:
     """Set the times of stored measurements, all or none; each is stored as a correction."""
     from service.base.settings import Settings
+    from service.sources.files import require_regular
     from service.store.database import require_store
-    from service.twin.photographs.corrections import correct_times
+    from service.twin.photographs.times import correct_times, read_times
     from service.twin.runtime.runtime import Runtime
 
-    given = read_times(file)
+    with require_regular(file).open(encoding="utf-8-sig", newline="") as lines:
+        given = read_times(lines, str(file))
     require_reason(reason)
     settings = Settings()
     require_store(settings)
@@ -49,32 +44,3 @@ def times(
         runtime.close()
     report = {"given": len(given), "changed": changed}
     typer.echo(json.dumps(report) if as_json else f"{len(given)} times, {changed} of them new")
-
-
-def read_times(file: Path) -> list["GivenTime"]:
-    """The times of a CSV file; InvalidInputError names the first line that is wrong."""
-    from pydantic import TypeAdapter, ValidationError
-
-    from service.base.fields import Moment
-    from service.base.validation_messages import format_validation_error
-    from service.sources.files import require_regular
-    from service.twin.photographs.corrections import GivenTime
-
-    moment, found = TypeAdapter(Moment), []
-    with require_regular(file).open(encoding="utf-8-sig", newline="") as lines:
-        reader = csv.DictReader(lines)
-        if not set(_COLUMNS) <= set(reader.fieldnames or ()):
-            raise InvalidInputError(
-                f"{file}: needs the columns {', '.join(_COLUMNS)} in its first line"
-            )
-        for row in reader:
-            try:
-                taken_at = moment.validate_python(row["taken_at"])
-            except ValidationError as error:
-                raise InvalidInputError(
-                    f"{file}, line {reader.line_num}: {format_validation_error(error, 'taken_at')}"
-                ) from None
-            found.append(GivenTime(row["heliostat"] or "", row["id"] or "", taken_at))
-    if not found:
-        raise InvalidInputError(f"{file}: holds no time")
-    return found

@@ -3,17 +3,15 @@
 A change applies to all images of the photograph.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 
 from sqlalchemy.orm import Session
 
-from model.errors import ModelError
 from model.imaging.light import camera_at
 from model.pointing import Weather
 from service import store
-from service.base.errors import ConflictError, GoneError, InvalidEntriesError, ServiceError
+from service.base.errors import ConflictError, GoneError
 from service.base.fields import Sun
 from service.sources.photograph import Photograph
 from service.store import audit
@@ -25,7 +23,7 @@ from service.store.rows import Change, Put, lock_row
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
 from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
 from service.twin.heliostats.metadata import photograph_from_row, stored_metadata
-from service.twin.photographs.ingest import measure_stored, measurement_row, require_past
+from service.twin.photographs.ingest import measure_stored, measurement_row
 from service.twin.runtime.runtime import Runtime
 from service.twin.warnings import find_sun_contradictions, other_warnings, sun_columns
 
@@ -47,7 +45,8 @@ _MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m",
 class PhotographChanges:
     """Corrected metadata of a photograph; None leaves a value unchanged.
 
-    ``excluded`` is whether the photograph is excluded from all computations.
+    ``excluded`` is whether the photograph is excluded from all computations. ``without_time``
+    removes a time that was wrong.
     """
 
     reason: str
@@ -57,6 +56,7 @@ class PhotographChanges:
     motor_position: tuple[float, float] | None = None
     weather: Weather = field(default_factory=Weather)
     excluded: bool | None = None
+    without_time: bool = False
 
     def of(self, row: MeasurementRow) -> Photograph:
         """The stored photograph with the changes applied."""
@@ -64,7 +64,9 @@ class PhotographChanges:
         stored = photograph_from_row(row)
         weather = {name: value for name, value in vars(self.weather).items() if value is not None}
         changes = {name: value for name in names if (value := getattr(self, name)) is not None}
-        return replace(stored, weather=replace(stored.weather, **weather), **changes)
+        without = {"taken_at": None} if self.without_time else {}
+        weather_now = replace(stored.weather, **weather)
+        return replace(stored, weather=weather_now, **(changes | without))
 
 
 def correct_photograph(
@@ -84,9 +86,9 @@ def correct_photograph(
     GoneError
         If an image must be re-measured, but is deleted.
     """
-    prepared = _prepare(runtime, heliostat, identifier, changes)
+    prepared = prepare_correction(runtime, heliostat, identifier, changes)
     with runtime.database.writing() as session:
-        row, change = _apply(session, prepared, actor)
+        row, change = apply_correction(session, prepared, actor)
         if change is Change.UNCHANGED:
             raise ConflictError(
                 f"measurement {identifier} has these values already; nothing changed"
@@ -94,74 +96,29 @@ def correct_photograph(
     return row
 
 
-@dataclass(frozen=True)
-class GivenTime:
-    """The time of a heliostat's measurement, submitted later."""
-
-    heliostat: str
-    identifier: str
-    taken_at: datetime
-
-
-def correct_times(runtime: Runtime, times: Sequence[GivenTime], reason: str, actor: str) -> int:
-    """Correct the times of many measurements, all or none; return how many changed.
-
-    Raises
-    ------
-    InvalidEntriesError
-        If a heliostat or measurement is not stored, a measurement is named twice, a time is in the
-        future, or an image that must be re-measured is deleted. The error names all wrong entries.
-    ConflictError
-        If another image of a photograph came meanwhile.
-    """
-    prepared: list[_Prepared] = []
-    wrong: dict[int, str] = {}
-    named: set[tuple[str, str]] = set()
-    for place, entry in enumerate(times):
-        try:
-            require_past(entry.taken_at)
-            ready = _prepare(
-                runtime,
-                entry.heliostat,
-                entry.identifier,
-                PhotographChanges(reason, taken_at=entry.taken_at),
-            )
-        except (ModelError, ServiceError) as error:
-            wrong[place] = str(error)
-            continue
-        images = {(entry.heliostat, name) for name in ready.fresh}
-        if named & images:
-            wrong[place] = (
-                f"measurement {entry.identifier} of {entry.heliostat} is named twice; name it once"
-            )
-        named |= images
-        prepared.append(ready)
-    if wrong:
-        raise InvalidEntriesError("times", wrong)
-    with runtime.database.writing() as session:
-        changes = [_apply(session, entry, actor).change for entry in prepared]
-    return changes.count(Change.CHANGED)
-
-
 @dataclass(frozen=True, eq=False)
-class _Prepared:
+class PreparedCorrection:
     """A correction before it is written.
 
-    ``fresh`` are the columns to write, by identifier of the photograph's images.
+    ``fresh`` are the columns to write, by identifier of the photograph's images. ``taken_at`` is
+    the stored time.
     """
 
     heliostat: str
     identifier: str
     changes: PhotographChanges
     fresh: dict[str, dict[str, object]]
+    taken_at: datetime | None
 
 
-def _prepare(
+def prepare_correction(
     runtime: Runtime, heliostat: str, identifier: str, changes: PhotographChanges
-) -> _Prepared:
+) -> PreparedCorrection:
+    """The new columns of a photograph; raises the errors of `correct_photograph`."""
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat)
-        images = images_of_photograph(session, store.get_measurement(session, twin.row, identifier))
+        row = store.get_measurement(session, twin.row, identifier)
+        taken_at, images = row.taken_at, images_of_photograph(session, row)
         named = (
             None if changes.target_name is None else store.get_target(session, changes.target_name)
         )
@@ -169,10 +126,12 @@ def _prepare(
         row.identifier: _new_values(runtime, twin, row, changes.of(row), named or row.target)
         for row in images.values()
     }
-    return _Prepared(heliostat, identifier, changes, fresh)
+    return PreparedCorrection(heliostat, identifier, changes, fresh, taken_at)
 
 
-def _apply(session: Session, prepared: _Prepared, actor: str) -> Put[MeasurementRow]:
+def apply_correction(
+    session: Session, prepared: PreparedCorrection, actor: str
+) -> Put[MeasurementRow]:
     """Write a correction to all images of a photograph, and return that of the prepared one."""
     heliostat, identifier, changes = prepared.heliostat, prepared.identifier, prepared.changes
     row_of_heliostat = store.get_heliostat(session, heliostat)

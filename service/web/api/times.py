@@ -4,7 +4,7 @@ from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
 from service.base.fields import MeasurementName, Model, Moment, Name, Reason
-from service.twin.photographs.corrections import GivenTime, correct_times
+from service.twin.photographs.times import MOST_TIMES, GivenTime, correct_times
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -15,8 +15,6 @@ from service.web.auth.dependencies import (
 from service.web.responses.openapi import problems
 
 router = APIRouter(prefix="/measurements", tags=["measurements"])
-
-_MOST = 2000
 
 
 class TimeIn(Model):
@@ -32,7 +30,7 @@ class TimesIn(Model):
 
     reason: Reason = Field(description="Where they come from; kept with each correction.")
     times: list[TimeIn] = Field(
-        min_length=1, max_length=_MOST, description="The times, by heliostat and measurement."
+        min_length=1, max_length=MOST_TIMES, description="The times, by heliostat and measurement."
     )
 
 

@@ -1,5 +1,6 @@
 """Page of all photographs, newest first, filtered by heliostat, verdict, target and time."""
 
+from collections.abc import Sequence
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Annotated
 from urllib.parse import urlencode
@@ -8,6 +9,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import Field, model_validator
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.fields import Model, Name, Version, drop_empty_fields
@@ -45,20 +47,34 @@ class PhotographsQuery(Model):
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
-    def link(self, before: int | None) -> str:
+    def link(self, before: int | None = None, path: str = "/photographs") -> str:
         """The URL of another page with the same filters."""
-        asked = {
-            **self.model_dump(mode="json", exclude_none=True, exclude={"before"}),
-            "before": before,
-        }
+        asked = self.model_dump(mode="json", exclude_none=True) | {"before": before}
         query_string = urlencode(
             {name: value for name, value in asked.items() if value is not None}
         )
-        return f"/photographs?{query_string}" if query_string else "/photographs"
+        return f"{path}?{query_string}" if query_string else path
+
+    def filter(self, session: Session) -> PhotographFilter:
+        """The same as a filter; NotFoundError if heliostat or target are not stored."""
+        return PhotographFilter(
+            None if self.heliostat is None else store.get_heliostat(session, self.heliostat),
+            None if self.target is None else store.get_target(session, self.target),
+            self.verdict,
+            _midnight(self.since),
+            _midnight(self.until, 1),
+            self.time,
+            self.warned,
+        )
 
 
 def _midnight(day: date | None, later: int = 0) -> datetime | None:
     return None if day is None else datetime.combine(day + timedelta(days=later), time(), UTC)
+
+
+def target_names(session: Session) -> Sequence[str]:
+    """Names of all targets."""
+    return session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
 
 
 @router.get("/photographs")
@@ -67,17 +83,8 @@ def get_photographs_page(
 ) -> HTMLResponse:
     """One page of photographs, with the filter form."""
     with runtime.database.reading() as session:
-        wanted = PhotographFilter(
-            None if query.heliostat is None else store.get_heliostat(session, query.heliostat),
-            None if query.target is None else store.get_target(session, query.target),
-            query.verdict,
-            _midnight(query.since),
-            _midnight(query.until, 1),
-            query.time,
-            query.warned,
-        )
-        groups = list_groups(session, wanted, LISTED + 1, query.before)
-        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
+        groups = list_groups(session, query.filter(session), LISTED + 1, query.before)
+        targets = target_names(session)
     older = query.link(groups[LISTED - 1].mark) if len(groups) > LISTED else None
     return render(
         request,

@@ -52,6 +52,7 @@ PATHS = (
     "/heliostats/AA39/photographs/100",
     "/heliostats/AB01",
     "/photographs",
+    "/photographs/times",
     "/forecast",
     "/forecasts/1",
     "/studies",

@@ -1,0 +1,159 @@
+"""Page that gives times to many photographs: by lines or an offset, with a preview and undo."""
+
+import csv
+import io
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, File, Form, Path, Query, Request, Response, UploadFile
+from fastapi.responses import HTMLResponse
+from pydantic import Field
+from sqlalchemy import func, select
+
+from model.errors import InvalidInputError
+from model.times import format_time
+from service.base.fields import Model, Reason, Version
+from service.store.tables import HeliostatRow, MeasurementRow
+from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.photographs.times import (
+    MOST_TIMES,
+    GivenTime,
+    correct_times,
+    list_time_changes,
+    preview_times,
+    read_times,
+    shifted_times,
+    undo_times,
+)
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    IdentityDep,
+    RuntimeDep,
+    require_multipart,
+)
+from service.web.pages.photograph_list import PhotographsQuery, target_names
+from service.web.responses.pages import go_to, render
+
+router = APIRouter(include_in_schema=False, prefix="/photographs/times", dependencies=[OPERATE])
+
+_MAX_CSV = 2**20  # [bytes]
+_LISTED = 5
+
+
+class ShiftForm(PhotographsQuery):
+    """The form that shifts the known times of a selection by ``minutes``."""
+
+    minutes: Annotated[float, Field(ge=-6e5, le=6e5)]
+    reason: Reason
+
+
+class TimesForm(Model):
+    """The form that stores what the preview showed, as CSV lines."""
+
+    lines: str
+    reason: Reason
+
+
+def _counts(runtime: Runtime) -> list[tuple[str, int]]:
+    """Heliostats with photographs of unknown time, the most first."""
+    row, n = (
+        MeasurementRow,
+        func.count(
+            func.distinct(func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier))
+        ),
+    )
+    query = select(HeliostatRow.name, n).join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
+    query = query.where(row.taken_at.is_(None)).group_by(HeliostatRow.name)
+    with runtime.database.reading() as session:
+        found = session.execute(query.order_by(n.desc(), HeliostatRow.name)).all()
+    return [(name, count) for name, count in found]
+
+
+@router.get("")
+def get_times_page(
+    request: Request, query: Annotated[PhotographsQuery, Query()], runtime: RuntimeDep
+) -> HTMLResponse:
+    """Photographs of unknown time by heliostat, the forms, and recent changes with undo."""
+    with runtime.database.reading() as session:
+        return render(
+            request,
+            "photograph_times.html",
+            query=query,
+            counts=_counts(runtime),
+            targets=target_names(session),
+            zone=plant_time_zone(session, runtime.settings.time_zone),
+            recent=list_time_changes(session, _LISTED),
+        )
+
+
+def _preview(
+    request: Request, runtime: Runtime, times: list[GivenTime], reason: str
+) -> HTMLResponse:
+    if len(times) > MOST_TIMES:
+        raise InvalidInputError(f"lines: {len(times)} times; give at most {MOST_TIMES} at once")
+    changes = preview_times(runtime, times)
+    lines = io.StringIO()
+    csv.writer(lines).writerows(
+        (one.given.heliostat, one.given.identifier, format_time(one.given.taken_at))
+        for one in changes
+        if one.given.taken_at is not None
+    )
+    return render(
+        request,
+        "photograph_times_preview.html",
+        changes=changes,
+        unchanged=len(times) - len(changes),
+        lines=lines.getvalue(),
+        reason=reason,
+    )
+
+
+@router.post("/preview", dependencies=[Depends(require_multipart), COMPUTE_SLOT])
+def post_lines_form(
+    request: Request,
+    runtime: RuntimeDep,
+    reason: Annotated[Reason, Form()],
+    lines: Annotated[str, Form(max_length=_MAX_CSV)] = "",
+    file: Annotated[UploadFile | None, File()] = None,
+) -> HTMLResponse:
+    """What the lines or the file would change; nothing is stored."""
+    data = b"" if file is None else file.file.read(_MAX_CSV + 1)
+    if len(data) > _MAX_CSV:
+        raise InvalidInputError(f"file: larger than {_MAX_CSV} bytes; send fewer lines")
+    with runtime.database.reading() as session:
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+    text = data.decode("utf-8-sig", "replace") if data else lines
+    times = read_times(text.splitlines(), "file" if data else "lines", zone)
+    return _preview(request, runtime, times, reason)
+
+
+@router.post("/shift", dependencies=[COMPUTE_SLOT])
+def post_shift_form(
+    request: Request, form: Annotated[ShiftForm, Form()], runtime: RuntimeDep
+) -> HTMLResponse:
+    """What an offset would change; nothing is stored."""
+    with runtime.database.reading() as session:
+        times = shifted_times(session, form.filter(session), form.minutes)
+    return _preview(request, runtime, times, form.reason)
+
+
+@router.post("", dependencies=[COMPUTE_SLOT])
+def post_times_form(
+    form: Annotated[TimesForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Store the times, and return to the page, which can undo them."""
+    times = read_times(form.lines.splitlines(), "lines")
+    correct_times(runtime, times, form.reason, identity.name)
+    return go_to("/photographs/times#recent-title")
+
+
+@router.post("/{number}/undo", dependencies=[COMPUTE_SLOT])
+def post_undo_form(
+    number: Annotated[Version, Path(description="Number of the audit trail's entry.")],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Restore the times before a change, and return to the page."""
+    undo_times(runtime, number, identity.name)
+    return go_to("/photographs/times#recent-title")
