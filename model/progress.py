@@ -22,6 +22,7 @@ class Steps:
     Attributes
     ----------
     report : Progress
+        Receives substeps: `SUBSTEPS` of each step.
     phase : str
         What is being computed.
     total : int
@@ -32,12 +33,24 @@ class Steps:
     phase: str = ""
     total: int = 0
     _done: list[None] = field(default_factory=list)  # its length counts: threads may append at once
+    _begun: list[None] = field(default_factory=list)  # signs of life since the last finished step
 
     def alive(self) -> None:
         """Report the progress; an exception of the report ends the computation here."""
-        self.report(self.phase, min(len(self._done), self.total), self.total)
+        self._begun.append(None)
+        self._report()
 
     def advance(self) -> None:
         """Count a step as done."""
         self._done.append(None)
-        self.alive()
+        self._begun.clear()
+        self._report()
+
+    def _report(self) -> None:
+        total = SUBSTEPS * self.total
+        done = SUBSTEPS * len(self._done) + min(len(self._begun), SUBSTEPS - 1)
+        self.report(self.phase, min(done, total), total)
+
+
+SUBSTEPS = 12
+"""Substeps of a step: as many signs of life as a minimization gives on average."""

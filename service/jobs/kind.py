@@ -65,9 +65,12 @@ class Context:
     alive_s: float = field(default_factory=time.monotonic)
     has_progressed: threading.Event = field(default_factory=threading.Event)
     """Set when this attempt has completed a step."""
+    expected_s: float | None = None
+    """Expected duration of the job [s], until its pace is known."""
     _first: tuple[float, float] | None = None
     """Time and completed share at the first report of this attempt."""
     _phase: str = ""
+    _share: float = 0.0
     _reporting: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
@@ -119,6 +122,7 @@ class Context:
             if phase == self._phase and time.monotonic() - self.reported_s < _REPORT_EVERY_S:
                 return
             self.reported_s, self._phase = time.monotonic(), phase
+            share = self._share = max(share, self._share)  # also if more steps become known
         progress = queue.Progress(share, message, phase, n_done, n_total, self._remaining_s(share))
         with self.runtime.database.writing() as session:
             if queue.report(session, self.lease, progress):
@@ -126,13 +130,13 @@ class Context:
         self.check()
 
     def _remaining_s(self, share: float) -> float | None:
-        """Expected time to the end [s] at the pace of this attempt; None while it is unknown."""
+        """Expected time to the end [s] at the pace of this attempt, else by ``expected_s``."""
         at = time.monotonic()
         if self._first is None:
             self._first = at, share
         begun_s, begun_share = self._first
         if share - begun_share < _MIN_SHARE or at - begun_s < _MIN_S:
-            return None
+            return None if self.expected_s is None else (1 - share) * self.expected_s
         return (1 - share) * (at - begun_s) / (share - begun_share)
 
     def steps(self) -> dict[str, dict[str, Any]]:

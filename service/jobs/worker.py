@@ -220,7 +220,10 @@ class Worker:
         """Run the handler, and return the outcome."""
         lease, kind = context.lease, self.kinds[job.kind]
         try:
-            result = kind.handler(context, kind.payload.model_validate(job.payload))
+            payload = kind.payload.model_validate(job.payload)
+            if kind.expected_s is not None:
+                context.expected_s = kind.expected_s(payload, self.runtime)
+            result = kind.handler(context, payload)
             arrays = None if result.arrays is None else pack(result.arrays)
             return _Ending(
                 "done", lambda session: queue.finish(session, lease, result.figures, arrays)

@@ -14,6 +14,7 @@ from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
 from model.plant import Facet, Heliostat
 from model.plant_model import JUELICH_MODEL
+from model.progress import SUBSTEPS
 from model.prior import GROUPS, default_prior, ripples
 from model.refinement import RefinementOptions, refine
 from model.refinement.half_samples import half_samples
@@ -245,7 +246,8 @@ def test_progress_of_a_refinement_is_counted_to_its_end(heliostat, truth):
     ]
     shares = [done / total for _, done, total in reports]
     assert shares == sorted(shares)
-    assert reports[-1][1] == reports[-1][2] == 14
+    assert reports[-1][1] == reports[-1][2] == 14 * SUBSTEPS
+    assert 0 < shares[len(reports) // 10] < 1 / 14  # during the first of the 14 minimizations
     assert len(reports) > 2 * 14
 
 

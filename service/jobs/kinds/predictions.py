@@ -18,7 +18,14 @@ from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.prediction import StoredSurface, compute_surface, keep_surface
+from service.twin.surfaces.prediction import (
+    READING,
+    STORING,
+    StoredSurface,
+    compute_surface,
+    keep_surface,
+    share_of,
+)
 
 
 class PredictionsIn(Model):
@@ -56,7 +63,7 @@ def predict_many(context: Context, payload: PredictionsIn) -> Result:
     version = _model_number(context.runtime, payload.model_version)
     for index, name in enumerate(names):
         progress = _Progress(context, name, index, len(names))
-        progress("photographs", 0, 1)
+        progress(READING, 0, 1)
         if name not in done:
             _predict_step(context, payload, name, version, progress)
     figures = changes(context.steps())
@@ -111,7 +118,7 @@ class _Progress:
             else (what, done, steps)
         )
         phase, n_done, n_total = counts
-        share = (self.index + done / max(steps, 1)) / self.total
+        share = (self.index + share_of(what, done, steps)) / self.total
         self.context.report(
             share, f"{self.name}: {what}", phase=phase, n_done=n_done, n_total=n_total
         )
@@ -129,6 +136,7 @@ def _predict_step(
             model_version=model_version,
             progress=progress,
         )
+        progress(STORING, 0, 1)
         with context.runtime.database.writing() as session:
             context.keep(session, name, _step(keep_surface(session, predicted, context.created_by)))
     except SKIPPED as error:

@@ -36,6 +36,17 @@ from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface,
 # Candidates per requested image, because some may contradict the others.
 _SPARE = 2
 
+READING, COMPARING, STORING = "reading photographs", "comparing with the active surface", "storing"
+"""Phases before and after the prediction itself, which names its phases."""
+
+_SHARES = {READING: (0.0, 0.05), COMPARING: (0.95, 0.99), STORING: (0.99, 1.0)}
+
+
+def share_of(phase: str, done: int, total: int) -> float:
+    """Share [1] of a prediction that is finished, by its phase and the steps of the phase."""
+    begin, end = _SHARES.get(phase, (0.05, 0.95))
+    return begin + (end - begin) * done / max(total, 1)
+
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
@@ -85,14 +96,15 @@ def compute_surface(
         today = store.find_surface_at(session, twin.row)
     with runtime.computing(f"predict_{method}") as operations:
         if measurements is None:
-            progress("choosing photographs that are consistent", 0, 1)
+            progress(READING, 0, len(rows))
             observations, _ = choose_observations(operations, twin, rows, images)
+            progress(READING, len(rows), len(rows))
         else:
             observations = to_observations(
                 [accepted_measurement(row, twin.origin) for row in rows], twin.heliostat
             )
         surface = operations.predict(twin.heliostat, observations, twin.model, method, progress)
-    progress("comparing it with the active surface", 1, 1)
+    progress(COMPARING, 0, 1)
     new = _new_surface(twin, surface, rows)
     with runtime.database.reading() as session:
         known = store.find_same_content(session, twin.row, new)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy import URL, select, update
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
@@ -26,6 +27,7 @@ from service.base.errors import ConflictError, TooManyError
 from service.base.settings import Settings
 from service.jobs import heartbeat
 from service.jobs.enqueuing import enqueue
+from service.jobs.kinds.predictions import EACH_S
 from service.jobs.worker import Worker, Workers, pause_s
 from service.store.database import Database
 from service.store.job_tables import AuditRow, JobRow
@@ -33,7 +35,7 @@ from service.store.jobs import queue
 from service.twin.runtime.runtime import Runtime
 from service.twin.runtime.slots import ComputeSlots
 from tests.forked import ForkedProcess, forked_process
-from tests.service import job_kinds
+from tests.service import job_kinds, real
 from tests.service.conftest import FakeOperations
 from tests.service.job_kinds import NEXT_PART, TEST_KINDS, WOKEN, SquareIn
 from tests.waiting import WAIT_LIMIT_S, child_process, until
@@ -321,6 +323,29 @@ def test_job_reports_phase_counts_and_remaining_time(runtime: Runtime):
     assert row.remaining_s is not None
     assert row.remaining_s > 0
     assert look(runtime, number).remaining_s is None
+
+
+def test_prediction_reports_its_phases_and_an_estimate_from_the_beginning(
+    real_client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    seen: list[queue.Progress] = []
+
+    def note(session: Any, lease: Any, progress: queue.Progress) -> bool:
+        seen.append(progress)
+        return False
+
+    monkeypatch.setattr("service.jobs.kind.queue.report", note)
+    real.run_job(real_client, "/v1/jobs/predictions", heliostats=["AC43"], images=2)
+    phases = list(dict.fromkeys(one.phase for one in seen))
+    assert (phases[0], *phases[-2:]) == (
+        "reading photographs",
+        "comparing with the active surface",
+        "storing",
+    )
+    shares = [one.share for one in seen]
+    assert shares == sorted(shares)
+    assert shares[-1] < 1
+    assert seen[0].remaining_s == pytest.approx(EACH_S["network"])
 
 
 def test_job_that_only_checks_whether_it_shall_end_learns_soon_that_it_was_cancelled(
