@@ -14,8 +14,8 @@ from model.metrics import surface_error
 from model.observation import Observation, misfits, render_observations
 from model.plant import Facet, Heliostat
 from model.plant_model import JUELICH_MODEL
-from model.progress import SUBSTEPS
 from model.prior import GROUPS, default_prior, ripples
+from model.progress import SUBSTEPS
 from model.refinement import RefinementOptions, refine
 from model.refinement.half_samples import half_samples
 from model.surface import halved
