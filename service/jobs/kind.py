@@ -63,12 +63,9 @@ class Context:
     lost: threading.Event = field(default_factory=threading.Event)
     reported_s: float = -math.inf
     alive_s: float = field(default_factory=time.monotonic)
-    has_progressed: threading.Event = field(default_factory=threading.Event)
-    """Set when this attempt has completed a step."""
-    expected_s: float | None = None
-    """Expected duration of the job [s], until its pace is known."""
-    _first: tuple[float, float] | None = None
-    """Time and completed share at the first report of this attempt."""
+    has_progressed: threading.Event = field(default_factory=threading.Event)  # completed a step
+    expected_s: float | None = None  # duration [s], until the pace is known
+    _first: tuple[float, float] | None = None  # time and share at the attempt's first report
     _phase: str = ""
     _share: float = 0.0
     _reporting: threading.Lock = field(default_factory=threading.Lock)
