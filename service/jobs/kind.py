@@ -211,6 +211,13 @@ class Kind(Generic[Payload]):
     require: Callable[[Settings], object] | None = None
     expected_s: Callable[[Payload, Runtime], float] | None = None
 
+    def run(self, context: Context, document: Mapping[str, Any]) -> Result:
+        """Do a job with the payload in ``document``."""
+        payload = self.payload.model_validate(document)
+        if self.expected_s is not None:
+            context.expected_s = self.expected_s(payload, context.runtime)
+        return self.handler(context, payload)
+
 
 Kinds = Mapping[str, Kind[Any]]
 

@@ -220,10 +220,7 @@ class Worker:
         """Run the handler, and return the outcome."""
         lease, kind = context.lease, self.kinds[job.kind]
         try:
-            payload = kind.payload.model_validate(job.payload)
-            if kind.expected_s is not None:
-                context.expected_s = kind.expected_s(payload, self.runtime)
-            result = kind.handler(context, payload)
+            result = kind.run(context, job.payload)
             arrays = None if result.arrays is None else pack(result.arrays)
             return _Ending(
                 "done", lambda session: queue.finish(session, lease, result.figures, arrays)
