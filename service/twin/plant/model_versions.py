@@ -28,7 +28,7 @@ from service.store.plant.model_versions import (
     list_models,
     version_name,
 )
-from service.store.tables import ModelRow
+from service.store.tables import ModelRow, StudyRow
 from service.twin.plant.open_questions import open_questions
 
 __all__ = [
@@ -42,10 +42,15 @@ __all__ = [
     "find_model",
     "get_model",
     "list_models",
+    "model_if_adopted",
     "newest_of",
     "version_name",
     "withdraw",
 ]
+
+
+Declaration = dict[str, object] | None
+"""A declared model, as stored; None is the default one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,16 +123,33 @@ def _row(session: Session, number: int) -> ModelRow | None:
 
 def _model_version(session: Session, row: ModelRow | None) -> ModelVersion:
     number, adopted = (DECLARED, ()) if row is None else (row.number, _effects(row.effects))
-    declared = parse_declared(declared_of(session, row) or {}, "the plant")
-    effects = (*declared.effects, *adopted)
+    return _compose(session, number, adopted, declared_of(session, row))
+
+
+def _compose(
+    session: Session, number: int, adopted: tuple[Effect, ...], declaration: Declaration
+) -> ModelVersion:
+    """The plant's model with a declaration and adopted effects."""
+    declared = parse_declared(declaration or {}, "the plant")
     return ModelVersion(
         site=Site.from_origin(store.get_plant(session).origin),
         optics=declared.optics,
-        effects=effects,
+        effects=(*declared.effects, *adopted),
         cameras=declared.cameras,
         number=number,
         version=version_name(number, adopted),
     )
+
+
+def _with_found(base: ModelRow | None, study: StudyRow) -> tuple[Effect, ...]:
+    """The effects of the version that a study used, and those that it found."""
+    return (*(() if base is None else _effects(base.effects)), *_effects(study.report))
+
+
+def model_if_adopted(session: Session, study: StudyRow) -> ModelVersion:
+    """The plant's model as it would be after a study, loaded with its report, is adopted."""
+    base, number = _row(session, study.model), current_number(session) + 1
+    return _compose(session, number, _with_found(base, study), declared_of(session, base))
 
 
 def find_model(session: Session, effects: Sequence[Effect]) -> ModelVersion | None:
@@ -195,8 +217,7 @@ def adopt(
             " reason to adopt it nevertheless"
         )
     base = _row(session, study.model)
-    before = () if base is None else _effects(base.effects)
-    row = add_model(session, (*before, *found), declared_of(session, base), study.id, actor)
+    row = add_model(session, _with_found(base, study), declared_of(session, base), study.id, actor)
     row.reason = reason
     names = [effect.name for effect in found]
     about = {"model": row.version, "effects": names, **_given(reason)}

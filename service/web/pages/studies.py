@@ -15,9 +15,22 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.jobs.kinds.studies import StudyIn
 from service.store.tables import PlantRow
 from service.twin.plant import model_versions
+from service.twin.studies.changes import (
+    EACH_S,
+    AccuracyChange,
+    forecast_changes,
+    heliostats_to_forecast,
+)
 from service.twin.studies.states import study_states
 from service.web.api.studies import REPORT_POLICY, study_html
-from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    READ,
+    RENDER_SLOT,
+    IdentityDep,
+    RuntimeDep,
+)
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False)
@@ -96,11 +109,36 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
             for name, fitted in effect.parameters.items()
         ],
         has_page=has_page,
+        accuracy=_accuracy_change(report),
+        n_forecasts=len(heliostats_to_forecast(row)),
+        forecast_s=EACH_S * len(heliostats_to_forecast(row)),
         state=state,
         adopted=state.version if state.adopted else None,
         current=current,
         outdated=outdated,
     )
+
+
+@router.get("/studies/{number}/change", dependencies=[READ, RENDER_SLOT, COMPUTE_SLOT])
+def get_change_page(number: Number, request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """What adopting a study would change in forecasts. They are computed for this page."""
+    with runtime.database.reading() as session:
+        row = store.get_study(session, number)
+        state = study_states(session, [row])[number]
+    if not state.findings.effects:
+        raise ConflictError(f"study {number} found no effect; adopting it changes nothing")
+    return render(
+        request,
+        "study_change.html",
+        study=row,
+        state=state,
+        accuracy=_accuracy_change(CheckedStudyReport.model_validate(row.report)),
+        changes=forecast_changes(runtime, row),
+    )
+
+
+def _accuracy_change(report: CheckedStudyReport) -> AccuracyChange | None:
+    return AccuracyChange.of(report.before.per_image, report.after.per_image)
 
 
 @router.get("/studies/{number}/report", dependencies=[READ])

@@ -104,6 +104,25 @@ def test_list_adopts_withdraws_and_adopts_again(real_client: TestClient):
     assert state() == "withdrawn (version 3)"
 
 
+def test_change_is_shown_before_it_is_adopted(real_client: TestClient):
+    page = text_of(real_client, "/studies/1")
+    assert "Compute the change of 2 forecasts" in page
+    assert "5 better, 0 worse" in page
+    change = text_of(real_client, "/studies/1/change")
+    assert "The flux stays the same: camera shoulder acts on the photographs" in change
+    rows = list(
+        csv.DictReader(real_client.get("/studies/1/change?table=changes").text.splitlines())
+    )
+    assert [row["Heliostat"] for row in rows] == ["AA39", "AC43"]
+    for row in rows:
+        assert row["Peak before [W/m²]"] == row["Peak after [W/m²]"]
+        assert float(row["Largest change [%]"]) == 0
+        assert float(row["In the camera's image [%]"]) > 5
+    assert "I have read this" in change
+    # It changes nothing.
+    assert real_client.get("/v1/models/current").json()["version"] == 1
+
+
 def test_job_predicts_outdated_surfaces_again(
     app: FastAPI, pages: TestClient, operations: FakeOperations
 ):

@@ -1,0 +1,151 @@
+"""What adopting the result of a study would change in forecasts, before it is adopted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from statistics import fmean
+
+from model.surface import control_points
+from service import store
+from service.base.errors import SKIPPED, NotFoundError
+from service.base.fields import Sun
+from service.store.tables import StudyRow
+from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_flux
+from service.twin.heliostats.measurements import (
+    HeliostatContext,
+    heights_of,
+    load_heliostat_context,
+)
+from service.twin.plant import model_versions
+from service.twin.runtime.operations import Forecast
+from service.twin.runtime.runtime import Runtime
+
+MAX_HELIOSTATS = 12
+"""Most heliostats whose forecasts are computed."""
+
+EACH_S = 0.2
+"""Stated duration of a heliostat's two forecasts [s]."""
+
+_RESOLUTION = (128, 128)
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastChange:
+    """Forecasts of a heliostat by the current model, and by the model after the adoption.
+
+    Sun and target are those of the heliostat's newest photograph, taken at ``taken_at``.
+    """
+
+    heliostat: str
+    target: str
+    taken_at: datetime | None
+    before: Forecast
+    after: Forecast
+
+    @property
+    def peak(self) -> float:
+        """Change of the peak, relative to the peak before."""
+        return self.after.peak / self.before.peak - 1
+
+    @property
+    def power(self) -> float:
+        """Change of the power, relative to the power before."""
+        return self.after.power / self.before.power - 1
+
+    @property
+    def largest(self) -> float:
+        """Largest change of irradiance at a place, relative to the peak before."""
+        return float(abs(self.after.flux - self.before.flux).max() / self.before.peak)
+
+    @property
+    def largest_in_camera(self) -> float:
+        """The same of the image that the camera would show."""
+        views = self.after.camera_view, self.before.camera_view
+        return float(abs(views[0] - views[1]).max() / views[1].max())
+
+
+@dataclass(frozen=True)
+class AccuracyChange:
+    """Changes of accuracy [1] on held-out photographs: mean, largest drop, largest gain, counts.
+
+    ``worst`` and ``best`` name the photographs with the largest drop and gain.
+    """
+
+    mean: float
+    worst: tuple[str, float]
+    best: tuple[str, float]
+    n_better: int
+    n_worse: int
+
+    @classmethod
+    def of(cls, before: Mapping[str, float], after: Mapping[str, float]) -> "AccuracyChange | None":
+        """The change between accuracies by photograph; None without photographs in both."""
+        changes = {name: after[name] - before[name] for name in before if name in after}
+        if not changes:
+            return None
+        order = sorted(changes, key=changes.__getitem__)
+        return cls(
+            fmean(changes.values()),
+            (order[0], changes[order[0]]),
+            (order[-1], changes[order[-1]]),
+            sum(change > 0 for change in changes.values()),
+            sum(change < 0 for change in changes.values()),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Changes by heliostat. ``skipped`` has the reasons of those that cannot be forecast."""
+
+    of: list[ForecastChange] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def mean_peak(self) -> float:
+        """Mean relative change of the peaks."""
+        return fmean(change.peak for change in self.of)
+
+    @property
+    def largest_peak(self) -> float:
+        """Largest relative change of a peak, up or down."""
+        return max((change.peak for change in self.of), key=abs)
+
+
+def heliostats_to_forecast(study: StudyRow) -> Sequence[str]:
+    """Heliostats of a study whose forecasts show the change, spread over those that it has."""
+    step = -(-len(study.heliostats) // MAX_HELIOSTATS)
+    return study.heliostats[:: max(step, 1)]
+
+
+def forecast_changes(runtime: Runtime, study: StudyRow) -> Changes:
+    """Forecast a study's heliostats by the current model, and by the one after its adoption."""
+    changes = Changes()
+    for name in heliostats_to_forecast(study):
+        try:
+            changes.of.append(_change(runtime, study, name))
+        except SKIPPED as error:
+            changes.skipped[name] = str(error)
+    return changes
+
+
+def _change(runtime: Runtime, study: StudyRow, name: str) -> ForecastChange:
+    with runtime.database.reading() as session:
+        twin = load_heliostat_context(session, name)
+        after = replace(twin, model=model_versions.model_if_adopted(session, study))
+        newest = store.recent_measurements(session, twin.row, 1)
+        if not newest:
+            raise NotFoundError(f"heliostat {name} has no photograph any more")
+        row, surface = newest[0], store.find_surface_at(session, twin.row)
+        request = ForecastRequest(
+            name,
+            Sun(azimuth_deg=row.sun_azimuth_deg, elevation_deg=row.sun_elevation_deg),
+            row.taken_at,
+            receiver=store.target_plane(row.target),
+            resolution=_RESOLUTION,
+        )
+        target, heights = row.target.name, heights_of(surface)
+
+    def trace(context: HeliostatContext) -> Forecast:
+        return trace_flux(runtime, context, control_points(twin.heliostat, heights), request)
+
+    return ForecastChange(name, target, row.taken_at, trace(twin), trace(after))

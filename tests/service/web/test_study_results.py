@@ -1,0 +1,85 @@
+"""Results of small real studies as pages, of every verdict; what their adoption would change."""
+
+import csv
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.service import real
+from tests.service.web.pages import text_of
+
+Studied = Callable[[int, str], TestClient]
+
+
+@pytest.fixture
+def studied(undeclared: Path, tmp_path: Path) -> Iterator[Studied]:
+    """A function that imports two heliostats of a set with an unknown effect, and studies them."""
+    with ExitStack() as stack:
+
+        def studied(number: int, candidate: str) -> TestClient:
+            source, folder = undeclared / f"set-{number}", tmp_path / "import" / "set"
+            folder.mkdir(parents=True)
+            for path in source.glob("*.json"):
+                shutil.copy(path, folder)
+            for path in sorted(path for path in source.iterdir() if path.is_dir())[::3]:
+                shutil.copytree(path, folder / path.name)
+            client = stack.enter_context(real.client_on(tmp_path))
+            real.run_job(client, "/v1/jobs/imports", folder="set")
+            real.run_job(client, "/v1/studies", candidates=[candidate])
+            return client
+
+        yield studied
+
+
+def test_an_effect_of_the_light_and_what_its_adoption_would_change(studied: Studied):
+    client = studied(1, "slope_error")
+    page = text_of(client, "/studies/1")
+    assert "effect found" in page
+    assert "Adopt slope error" in page
+    assert not page.all("input", name="read")  # nothing is open, so nothing must be confirmed
+    assert "Reason (optional)" in page
+    change = text_of(client, "/studies/1/change")
+    assert "The flux stays the same" not in change
+    sheet = client.get("/studies/1/change?table=changes").text
+    rows = list(csv.DictReader(sheet.splitlines()))
+    assert [row["Heliostat"] for row in rows] == ["AA38", "AU18"]
+    before, after = (
+        [float(row[f"Peak {when} [W/m²]"]) for row in rows] for when in ("before", "after")
+    )
+    assert all(b < a for a, b in zip(before, after, strict=True))  # rough mirrors spread the light
+    assert client.post("/studies/1/adopt", data={}, follow_redirects=False).status_code == 303
+    # The forecast is then what the page said.
+    again = client.get("/studies/1/change?table=changes").text
+    forecast = [float(row["Peak before [W/m²]"]) for row in csv.DictReader(again.splitlines())]
+    assert forecast == pytest.approx(after)
+
+
+def test_nothing_missing_and_not_explained_have_nothing_to_adopt(studied: Studied):
+    client = studied(2, "slope_error")
+    page = text_of(client, "/studies/1")
+    assert "nothing missing" in page
+    assert "there is nothing to adopt" in page
+    for path in ("/studies/1", "/studies"):
+        assert not text_of(client, path).all("form", action="/studies/1/adopt")
+    assert "changes nothing" in client.get("/studies/1/change").json()["detail"]
+
+
+def test_not_explained(studied: Studied):
+    client = studied(3, "sun_shape")
+    page = text_of(client, "/studies/1")
+    assert "not explained" in page
+    assert "there is nothing to adopt" in page
+    assert client.get("/v1/studies/1").json()["state"] == "nothing_to_adopt"
+
+
+def test_too_few_photographs_end_the_job_with_the_reason(real_client: TestClient):
+    answer = real_client.post("/v1/studies", json={"heliostats": ["AA39"], "images": 2})
+    assert real.worker(real_client).work()
+    page = text_of(real_client, f"/jobs/{answer.json()['id']}")
+    assert "failed" in page
+    assert "a study takes at least" in page
+    assert len(real_client.get("/v1/studies").json()["items"]) == 1
