@@ -314,8 +314,12 @@ def administrate(record: Recorder, key: str) -> None:
     waiting = record.call("post_predictions_job", "POST /v1/jobs/predictions", 202, json={})
     record.call("cancel_job", f"POST /v1/jobs/{waiting['id']}/cancel")
     alerts = record.call("list_attention", "GET /v1/attention")["items"]
-    ids = {"ids": [alerts[0]["id"]]}
+    ids = {"ids": [alerts[0]["id"]], "reason": "the camera is being repaired"}
     record.call("post_acknowledgements", "POST /v1/attention/acknowledgements", json=ids)
+    path = "/v1/attention/acknowledgements"
+    batches = record.call("list_acknowledgements", f"GET {path}")["items"]
+    record.call("list_attention_history", "GET /v1/attention/history")
+    record.call("undo_acknowledgements", f"POST {path}/{batches[0]['id']}/undo")
     record.call("delete_target", "DELETE /v1/targets/upper-target", 204)
     record.call("delete_receiver", "DELETE /v1/receivers/upper-receiver", 204)
     record.call("list_audit", "GET /v1/audit")

@@ -1,49 +1,228 @@
-"""Storage of acknowledged alerts."""
+"""Storage of acknowledged alerts, and of the history of alerts."""
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import NamedTuple
 
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session, load_only
+
+from service.base.errors import ConflictError, NotFoundError
 from service.store import audit
-from service.store.job_tables import AcknowledgementRow
+from service.store.columns import now
+from service.store.job_tables import AcknowledgementRow, AlarmRow
 from service.store.rows import serialize_writers
 from service.store.tables import HeliostatRow
 
-Key = tuple[str | None, str, str]
-"""Heliostat name (None for the plant), reason and fingerprint of an alert."""
+
+class Key(NamedTuple):
+    """What identifies an alert; ``heliostat`` is None for the plant."""
+
+    heliostat: str | None
+    reason: str
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class AcknowledgementBatch:
+    """Alerts that were acknowledged together, with the number of those of each reason."""
+
+    id: int
+    made_at: datetime
+    made_by: str
+    comment: str
+    undone_at: datetime | None
+    undone_by: str | None
+    reasons: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class AlarmHistory:
+    """An alert from its beginning to its end, with its acknowledgements, oldest first."""
+
+    heliostat: str | None
+    row: AlarmRow
+    acknowledgements: tuple[AcknowledgementRow, ...]
 
 
 def acknowledged(session: Session) -> dict[Key, AcknowledgementRow]:
-    """Return all acknowledgements."""
+    """Return all acknowledgements that were not undone."""
+    rows = _acknowledgements().where(AcknowledgementRow.undone_at.is_(None))
+    return {_key(name, row): row for name, row in session.execute(rows)}
+
+
+def _acknowledgements() -> Select[str, AcknowledgementRow]:
     query = select(HeliostatRow.name, AcknowledgementRow).select_from(AcknowledgementRow)
-    rows = session.execute(
-        query.outerjoin(HeliostatRow, HeliostatRow.id == AcknowledgementRow.heliostat_id)
-    )
-    return {(name, row.reason, row.fingerprint): row for name, row in rows}
+    return query.outerjoin(HeliostatRow, HeliostatRow.id == AcknowledgementRow.heliostat_id)
+
+
+def _alarms() -> Select[str, AlarmRow]:
+    query = select(HeliostatRow.name, AlarmRow).select_from(AlarmRow)
+    return query.outerjoin(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
+
+
+def _key(heliostat: str | None, row: AcknowledgementRow | AlarmRow) -> Key:
+    return Key(heliostat, row.reason, row.fingerprint)
 
 
 def acknowledge(
-    session: Session, heliostat: HeliostatRow | None, reason: str, fingerprint: str, actor: str
-) -> AcknowledgementRow:
-    """Record that ``actor`` has seen an alert. An earlier acknowledgement remains."""
+    session: Session, keys: Sequence[Key], actor: str, comment: str
+) -> list[AcknowledgementRow]:
+    """Record that ``actor`` has seen alerts, as one batch. Earlier acknowledgements remain.
+
+    Raises
+    ------
+    NotFoundError
+        If a heliostat was deleted.
+    """
     serialize_writers(session)
-    row = AcknowledgementRow(
-        heliostat_id=heliostat and heliostat.id,
-        reason=reason,
-        fingerprint=fingerprint,
-        made_by=actor,
-    )
-    same = select(AcknowledgementRow).where(
-        AcknowledgementRow.reason == reason, AcknowledgementRow.fingerprint == fingerprint
-    )
-    held = session.scalar(
-        same.where(AcknowledgementRow.heliostat_id.is_not_distinct_from(row.heliostat_id)).limit(1)
-    )
-    if held is not None:
-        return held
-    session.add(row)
+    held, ids = acknowledged(session), _heliostat_ids(session)
+    rows = {key: held[key] for key in keys if key in held}
+    new = {
+        key: AcknowledgementRow(
+            heliostat_id=_heliostat_id(ids, key),
+            reason=key.reason,
+            fingerprint=key.fingerprint,
+            made_by=actor,
+            comment=comment,
+        )
+        for key in dict.fromkeys(keys)
+        if key not in rows
+    }
+    session.add_all(new.values())
     session.flush()
-    subject = "plant" if heliostat is None else f"heliostat {heliostat.name}"
-    audit.record(
-        session, actor, "attention.acknowledged", subject, reason=reason, fingerprint=fingerprint
+    batch = min((row.id for row in new.values()), default=None)
+    for key, row in new.items():
+        row.batch = batch
+        _audit(session, actor, "attention.acknowledged", key, comment=comment)
+    return [(rows | new)[key] for key in keys]
+
+
+def _heliostat_ids(session: Session) -> dict[str, int]:
+    rows = session.scalars(select(HeliostatRow).options(load_only(HeliostatRow.name)))
+    return {row.name: row.id for row in rows}
+
+
+def _heliostat_id(ids: Mapping[str, int], key: Key) -> int | None:
+    if key.heliostat is not None and key.heliostat not in ids:
+        raise NotFoundError(f"Heliostat {key.heliostat} not found.")
+    return None if key.heliostat is None else ids[key.heliostat]
+
+
+def _audit(session: Session, actor: str, action: str, key: Key, **more: object) -> None:
+    subject = "plant" if key.heliostat is None else f"heliostat {key.heliostat}"
+    about = {"reason": key.reason, "fingerprint": key.fingerprint, **more}
+    audit.record(session, actor, action, subject, **about)
+
+
+def undo(session: Session, batch: int, actor: str) -> list[Key]:
+    """Undo the acknowledgements of a batch; return what they were of.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such batch.
+    ConflictError
+        If it was undone before.
+    """
+    serialize_writers(session)
+    rows = session.execute(_acknowledgements().where(AcknowledgementRow.batch == batch))
+    found = {_key(name, row): row for name, row in rows}
+    if not found:
+        raise NotFoundError(f"Acknowledgement {batch} not found.")
+    for key, row in found.items():
+        if row.undone_at is not None:
+            raise ConflictError(
+                f"acknowledgement {batch} was undone by {row.undone_by}; acknowledge again"
+            )
+        row.undone_at, row.undone_by = now(), actor
+        _audit(session, actor, "attention.undone", key, acknowledgement=batch)
+    return list(found)
+
+
+def list_batches(
+    session: Session, limit: int, after: int | None = None, number: int | None = None
+) -> list[AcknowledgementBatch]:
+    """Up to ``limit`` batches older than ``after``, newest first, or only batch ``number``."""
+    column = AcknowledgementRow.batch
+    chosen = select(column).where(column.is_not(None)).distinct().order_by(column.desc())
+    if after is not None:
+        chosen = chosen.where(column < after)
+    if number is not None:
+        chosen = chosen.where(column == number)
+    numbers = session.scalars(chosen.limit(limit)).all()
+    rows: dict[int | None, list[AcknowledgementRow]] = defaultdict(list)
+    for row in session.scalars(select(AcknowledgementRow).where(column.in_(numbers))):
+        rows[row.batch].append(row)
+    return [
+        AcknowledgementBatch(
+            number or 0,
+            first.made_at,
+            first.made_by,
+            first.comment,
+            first.undone_at,
+            first.undone_by,
+            Counter(row.reason for row in rows[number]),
+        )
+        for number in numbers
+        for first in rows[number][:1]
+    ]
+
+
+# --- history
+# --------------------------------------------------------------------------------------------------
+
+
+def open_alarms(session: Session) -> dict[Key, AlarmRow]:
+    """Return the alerts that are recorded as present."""
+    rows = session.execute(_alarms().where(AlarmRow.closed_at.is_(None)))
+    return {_key(name, row): row for name, row in rows}
+
+
+def record_alarms(session: Session, present: Mapping[Key, tuple[str, datetime]]) -> None:
+    """Record which alerts are present, each with its message and since when.
+
+    Recorded ones that are not present are closed.
+    """
+    serialize_writers(session)
+    held, ids = open_alarms(session), _heliostat_ids(session)
+    for key in held.keys() - present.keys():
+        held[key].closed_at = now()
+    for key, (message, since) in present.items():
+        if key not in held and (key.heliostat is None or key.heliostat in ids):
+            session.add(
+                AlarmRow(
+                    heliostat_id=_heliostat_id(ids, key),
+                    reason=key.reason,
+                    fingerprint=key.fingerprint,
+                    message=message,
+                    since=since,
+                )
+            )
+
+
+def list_history(
+    session: Session,
+    limit: int,
+    after: int | None = None,
+    reason: str | None = None,
+    heliostat: str | None = None,
+) -> list[AlarmHistory]:
+    """Up to ``limit`` alerts older than record ``after``, the newest first."""
+    query = _alarms().order_by(AlarmRow.id.desc()).limit(limit)
+    if after is not None:
+        query = query.where(AlarmRow.id < after)
+    if reason is not None:
+        query = query.where(AlarmRow.reason == reason)
+    if heliostat is not None:
+        query = query.where(HeliostatRow.name == heliostat)
+    rows = session.execute(query).all()
+    made: dict[Key, list[AcknowledgementRow]] = defaultdict(list)
+    seen = _acknowledgements().where(
+        AcknowledgementRow.fingerprint.in_({row.fingerprint for _, row in rows})
     )
-    return row
+    for name, row in session.execute(seen.order_by(AcknowledgementRow.id)):
+        made[_key(name, row)].append(row)
+    return [AlarmHistory(name, row, tuple(made[_key(name, row)])) for name, row in rows]

@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Any, get_args
 
-from sqlalchemy import ForeignKey, Index, LargeBinary, String, UniqueConstraint, false, text
+from sqlalchemy import ForeignKey, Index, LargeBinary, String, Text, UniqueConstraint, false, text
 from sqlalchemy.orm import Mapped, mapped_column
 
 from service.base.choices import RoleName
@@ -111,7 +111,8 @@ class SessionRow(Base):
 class AcknowledgementRow(Base):
     """An acknowledged alert of a heliostat or of the plant (`service.twin.alerts.alerts`).
 
-    It applies while the alert's fingerprint equals ``fingerprint``.
+    It applies while the alert's fingerprint equals ``fingerprint``, until somebody undoes it.
+    Those of one ``batch`` were made together, with the reason ``comment``.
     """
 
     __tablename__ = "acknowledgements"
@@ -122,6 +123,28 @@ class AcknowledgementRow(Base):
     fingerprint: Mapped[str] = mapped_column(String(96))
     made_at: Mapped[datetime] = mapped_column(default=now)
     made_by: Mapped[str] = mapped_column(String(64))
+    batch: Mapped[int | None] = mapped_column(index=True)
+    comment: Mapped[str] = mapped_column(String(200), default="", server_default=text("''"))
+    undone_at: Mapped[datetime | None]
+    undone_by: Mapped[str | None] = mapped_column(String(64))
+
+
+class AlarmRow(Base):
+    """An alert of a heliostat or of the plant, from when it was first seen until it was gone.
+
+    ``since`` is when its reason began, which may be long before ``opened_at``.
+    """
+
+    __tablename__ = "alarms"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    heliostat_id: Mapped[int | None] = mapped_column(ForeignKey("heliostats.id"), index=True)
+    reason: Mapped[str] = mapped_column(String(32))
+    fingerprint: Mapped[str] = mapped_column(String(96))
+    message: Mapped[str] = mapped_column(Text)
+    since: Mapped[datetime]
+    opened_at: Mapped[datetime] = mapped_column(default=now)
+    closed_at: Mapped[datetime | None] = mapped_column(index=True)
 
 
 class AuditRow(Base):

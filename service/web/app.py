@@ -17,7 +17,7 @@ from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
 from service.store.database import Database
-from service.twin.alerts.alerts import AlertCount
+from service.twin.alerts.counts import AlertCount
 from service.twin.alerts.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Operations, Runtime
 from service.twin.runtime.slots import MAX_WAITING

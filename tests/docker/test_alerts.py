@@ -163,7 +163,7 @@ def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
             "1 heliostats have no recent photograph"
         )
         (item,) = service.get("/v1/attention").json()["items"]
-        service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
+        service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
         until(lambda: bool(of("resolved")), "its end is delivered")
 
 

@@ -5,7 +5,7 @@ from sqlalchemy.orm import Session
 
 from service.base.errors import ConflictError
 from service.store.columns import Base
-from service.store.job_tables import AcknowledgementRow, JobRow
+from service.store.job_tables import AcknowledgementRow, AlarmRow, JobRow
 from service.store.jobs.queue import ENDED
 from service.store.plant.geometry import get_heliostat, get_receiver, get_target
 from service.store.rows import serialize_writers
@@ -61,8 +61,9 @@ def remove_heliostat(session: Session, name: str) -> None:
     }
     # A study refers to names, because its photographs may be deleted before the study.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))
-    # Acknowledged alerts do not prevent removal. If the removal fails, they are restored.
-    session.execute(delete(AcknowledgementRow).where(AcknowledgementRow.heliostat_id == row.id))
+    # The history of alerts does not prevent removal. If the removal fails, it is restored.
+    for table in (AcknowledgementRow, AlarmRow):
+        session.execute(delete(table).where(table.heliostat_id == row.id))
     _delete_unused(session, row, f"heliostat {name}", {**users, "studies": studied})
 
 

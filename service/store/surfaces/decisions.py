@@ -161,6 +161,16 @@ def acknowledge_warnings(
         audit.record(session, actor, "surface.acknowledged", subject, version=surface.version)
 
 
+def forget_acknowledgement(
+    session: Session, heliostat: HeliostatRow, surface: SurfaceRow, actor: str
+) -> None:
+    """Undo `acknowledge_warnings`."""
+    if surface.acknowledged_by is not None:
+        surface.acknowledged_at = surface.acknowledged_by = None
+        subject = f"heliostat {heliostat.name}"
+        audit.record(session, actor, "surface.unacknowledged", subject, version=surface.version)
+
+
 def list_decisions(
     session: Session, heliostat: HeliostatRow, limit: int, after: int | None = None
 ) -> Sequence[DecisionRow]:

@@ -8,9 +8,6 @@ or when its measured value doubles.
 
 import hashlib
 import math
-import threading
-import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -23,15 +20,12 @@ from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
-from service import store
-from service.base.errors import NotFoundError
 from service.base.settings import Settings
 from service.store import acknowledgements
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, JobRow
 from service.store.jobs import queue
 from service.store.photographs.measurements import EXCLUDED, has_warning
-from service.store.surfaces import decisions
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -49,22 +43,19 @@ from service.twin.alerts.field_overview import (
     FieldOverviewCache,
     HeliostatOverview,
 )
-from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason, Severity
+from service.twin.alerts.reasons import REASONS, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
-from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import FIGURES, CameraChange
-
-# Longest time that the count in the pages' menu is reused [s].
-_COUNT_HOLDS_S = 15.0
 
 
 @dataclass(frozen=True)
 class Alert:
     """An alert of a heliostat, or of the plant if ``heliostat`` is None.
 
-    ``measurements`` are identifiers of the heliostat's measurements to look at.
+    ``measurements`` are identifiers of the heliostat's measurements to look at. ``acknowledgement``
+    is the number of the batch in which it was acknowledged, for ``acknowledged_reason``.
     """
 
     reason: Reason
@@ -76,6 +67,23 @@ class Alert:
     acknowledged_by: str | None = None
     acknowledged_at: datetime | None = None
     measurements: tuple[str, ...] = ()
+    acknowledged_reason: str | None = None
+    acknowledgement: int | None = None
+
+    @property
+    def key(self) -> acknowledgements.Key:
+        """What identifies the alert in the store."""
+        return acknowledgements.Key(self.heliostat, self.reason, self.fingerprint)
+
+    def with_acknowledgement(self, row: AcknowledgementRow) -> "Alert":
+        """Add who acknowledged the alert, when and why."""
+        return replace(
+            self,
+            acknowledged_by=row.made_by,
+            acknowledged_at=row.made_at,
+            acknowledged_reason=row.comment or None,
+            acknowledgement=row.batch,
+        )
 
     @property
     def id(self) -> str:
@@ -133,20 +141,12 @@ def alerts_of_heliostats(
         found += _of_heliostat(line, settings, at)
     known = acknowledgements.acknowledged(session)
     order = {reason: place for place, reason in enumerate(REASONS)}
-    items = [_with_acknowledgement(item, known) for item in found]
+    items = [
+        item if (row := known.get(item.key)) is None else item.with_acknowledgement(row)
+        for item in found
+    ]
     return sorted(
         items, key=lambda item: (order[item.reason], -item.since.timestamp(), item.heliostat or "")
-    )
-
-
-def _with_acknowledgement(
-    item: Alert, acknowledged: dict[acknowledgements.Key, AcknowledgementRow]
-) -> Alert:
-    row = acknowledged.get((item.heliostat, item.reason, item.fingerprint))
-    return (
-        item
-        if row is None
-        else replace(item, acknowledged_by=row.made_by, acknowledged_at=row.made_at)
     )
 
 
@@ -173,7 +173,7 @@ def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Aler
         "; ".join(surface.warnings or ()),
         f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict"
         " its surface again",
-        since.isoformat(),
+        f"{since.isoformat()} {hashlib.sha256(which.encode()).hexdigest()[:8]}",
         surface.acknowledged_by,
         surface.acknowledged_at,
         photographs,
@@ -486,80 +486,3 @@ def _declared_anew(session: Session) -> ModelRow | None:
     cameras = [(document or {}).get("cameras") for document in declared]
     changed = [row for row, (old, new) in zip(rows, pairwise(cameras), strict=True) if old != new]
     return changed[-1] if changed else None
-
-
-# --- acknowledging
-# --------------------------------------------------------------------------------------------------
-
-
-def acknowledge(
-    runtime: Runtime, cache: FieldOverviewCache, ids: Sequence[str], actor: str
-) -> list[Alert]:
-    """Acknowledge alerts for ``actor``; return them in the order of their ids.
-
-    Raises
-    ------
-    NotFoundError
-        If an id is not a current alert. Then none is acknowledged.
-    """
-    with runtime.database.reading() as session:
-        items = {item.id: item for item in list_alerts(session, cache, runtime.settings)[0]}
-    missing = [number for number in ids if number not in items]
-    if missing:
-        raise NotFoundError(
-            f"ids: {missing[0]} does not need attention, or its reason changed; see /v1/attention"
-        )
-    with runtime.database.writing() as session:
-        return [_acknowledge(session, items[number], actor) for number in ids]
-
-
-def _acknowledge(session: Session, item: Alert, actor: str) -> Alert:
-    heliostat = None if item.heliostat is None else store.get_heliostat(session, item.heliostat)
-    if heliostat is not None and item.reason == "untrusted":
-        surface = store.find_candidate(session, heliostat) or store.get_surface_at(
-            session, heliostat
-        )
-        decisions.acknowledge_warnings(session, heliostat, surface, actor)
-        return replace(
-            item, acknowledged_by=surface.acknowledged_by, acknowledged_at=surface.acknowledged_at
-        )
-    row = acknowledgements.acknowledge(session, heliostat, item.reason, item.fingerprint, actor)
-    return replace(item, acknowledged_by=row.made_by, acknowledged_at=row.made_at)
-
-
-class AlertCount:
-    """Numbers of open alerts, which nobody has acknowledged, for the menu of every page.
-
-    They are cached for some seconds.
-    """
-
-    def __init__(self, runtime: Runtime, cache: FieldOverviewCache) -> None:
-        self._runtime, self._cache = runtime, cache
-        self._lock = threading.Lock()
-        self._counted: dict[Severity, int] = dict.fromkeys(SEVERITIES, 0)
-        self._counted_s = -math.inf
-
-    def by_severity(self) -> dict[Severity, int]:
-        """The number of open alerts of each severity, at most some seconds old."""
-        with self._lock:
-            if time.monotonic() - self._counted_s >= _COUNT_HOLDS_S:
-                with self._runtime.database.reading() as session:
-                    items, _ = list_alerts(session, self._cache, self._runtime.settings)
-                counted = Counter(item.severity for item in items if item.acknowledged_by is None)
-                self._counted = {severity: counted[severity] for severity in SEVERITIES}
-                self._counted_s = time.monotonic()
-            return dict(self._counted)
-
-    def read(self) -> int:
-        """The number of all open alerts."""
-        return sum(self.by_severity().values())
-
-    @property
-    def last(self) -> int:
-        """The number of all open alerts at the last count, without a new one."""
-        return sum(self._counted.values())
-
-    def forget(self) -> None:
-        """Count again at the next read, because an alert was acknowledged."""
-        with self._lock:
-            self._counted_s = -math.inf

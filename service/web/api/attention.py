@@ -2,14 +2,24 @@
 
 from datetime import datetime
 from operator import attrgetter
-from typing import Annotated
+from typing import Annotated, cast
 
-from fastapi import APIRouter, Body, Depends, Query, Request
+from fastapi import APIRouter, Body, Depends, Path, Query, Request
 from pydantic import BaseModel, Field
 
-from service.base.fields import From, Model
-from service.twin.alerts.alerts import Alert, AlertCount, acknowledge, list_alerts
-from service.twin.alerts.reasons import Reason, Severity
+from service.base import fields
+from service.base.fields import Author, CreatedAt, From, Id, Model, Name, Version, from_row
+from service.store import acknowledgements
+from service.store.acknowledgements import AcknowledgementBatch, AlarmHistory
+from service.twin.alerts.acknowledging import (
+    AlertFilter,
+    acknowledge,
+    read_history,
+    undo_acknowledgement,
+)
+from service.twin.alerts.alerts import Alert, list_alerts
+from service.twin.alerts.counts import AlertCount
+from service.twin.alerts.reasons import REASONS, Reason, Severity
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
@@ -55,6 +65,10 @@ class AttentionOut(BaseModel):
     )
     acknowledged_by: str | None = Field(description="Name of the key; null if not acknowledged.")
     acknowledged_at: datetime | None = Field(description="When; null: it is not.")
+    acknowledged_reason: str | None = Field(description="Why; null: it is not, or none was given.")
+    acknowledgement: int | None = Field(
+        description="Number of the acknowledgement, which may be undone; null: there is none."
+    )
 
 
 def attention_out(item: Alert) -> AttentionOut:
@@ -76,6 +90,40 @@ class AcknowledgementsIn(Model):
     ids: list[ItemId] = Field(
         min_length=1, max_length=500, description="Ids of items of `GET /v1/attention`."
     )
+    reason: fields.Reason
+
+
+class AcknowledgementOut(BaseModel):
+    """Alerts that were acknowledged together."""
+
+    id: Id
+    made_at: CreatedAt
+    made_by: Author
+    reason: str = Field(description="Why; empty if it was acknowledged before reasons were asked.")
+    alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
+    undone_at: datetime | None = Field(description="When it was undone; null: it was not.")
+    undone_by: str | None = Field(description="Name of the key that undid it.")
+
+
+class AlertHistoryOut(BaseModel):
+    """An alert from its beginning to its end."""
+
+    id: Id
+    reason: Reason
+    severity: Severity
+    heliostat: str | None = Field(description="null: the plant as a whole.")
+    since: From
+    message: str = Field(description="What was wrong, when it was first seen.")
+    opened_at: datetime = Field(description="When the service first saw it.")
+    closed_at: datetime | None = Field(description="When it was gone; null: it is present.")
+    acknowledgements: list[AcknowledgementOut] = Field(
+        description="Its acknowledgements, oldest first; also those that were undone."
+    )
+
+
+After = Annotated[Version | None, Query(description="The last id of the page before.")]
+
+_ID = attrgetter("id")
 
 
 async def _count(request: Request) -> AlertCount:
@@ -94,6 +142,7 @@ def list_attention(
     severity: Annotated[
         int | None, Query(ge=1, le=3, description="Only this severity: 1, 2 or 3.")
     ] = None,
+    heliostat: Annotated[Name | None, Query(description="Only this heliostat.")] = None,
     acknowledged: Annotated[
         bool | None, Query(description="Only alerts that are, or are not, acknowledged.")
     ] = None,
@@ -103,15 +152,8 @@ def list_attention(
     """List alerts, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
         items, pending = list_alerts(session, cache, runtime.settings)
-    wanted = [
-        item
-        for item in items
-        if reason in (None, item.reason)
-        and severity in (None, item.severity)
-        and acknowledged in (None, item.acknowledged_by is not None)
-        and (after is None or item.id > after)
-    ]
-    wanted.sort(key=attrgetter("id"))
+    chosen = AlertFilter(reason, severity, heliostat, acknowledged).choose(items)
+    wanted = sorted((item for item in chosen if after is None or item.id > after), key=_ID)
     part = page([attention_out(item) for item in wanted[: limit + 1]], limit)
     return AttentionPage(items=part.items, next=part.next, pending=pending)
 
@@ -128,11 +170,71 @@ def post_acknowledgements(
     identity: IdentityDep,
     seen: Annotated[AcknowledgementsIn, Body()],
 ) -> Page[AttentionOut]:
-    """Acknowledge alerts.
+    """Acknowledge alerts together, with a reason.
 
-    An acknowledgement lasts until the reason of the alert changes or returns. The first one is
-    kept.
+    An acknowledgement lasts until the reason of the alert changes or returns, or until it is
+    undone. The first one is kept.
     """
-    items = acknowledge(runtime, cache, seen.ids, identity.name)
+    items = acknowledge(runtime, cache, seen.ids, identity.name, seen.reason)
     count.forget()
     return Page(items=[attention_out(item) for item in items], next=None)
+
+
+@router.get("/acknowledgements", responses=problems(), dependencies=[READ])
+def list_acknowledgements(
+    runtime: RuntimeDep, limit: Limit = 100, after: After = None
+) -> Page[AcknowledgementOut]:
+    """List acknowledgements, newest first, also those that were undone."""
+    with runtime.database.reading() as session:
+        rows = acknowledgements.list_batches(session, limit + 1, after)
+    return page([_acknowledgement(row) for row in rows], limit)
+
+
+@router.post(
+    "/acknowledgements/{number}/undo", responses=problems(404, 409), dependencies=[OPERATE]
+)
+def undo_acknowledgements(
+    number: Annotated[Version, Path(description="Number of the acknowledgement.")],
+    runtime: RuntimeDep,
+    count: AttentionCountDep,
+    identity: IdentityDep,
+) -> AcknowledgementOut:
+    """Undo an acknowledgement: its alerts are open again."""
+    undo_acknowledgement(runtime, number, identity.name)
+    count.forget()
+    with runtime.database.reading() as session:
+        (row,) = acknowledgements.list_batches(session, 1, number=number)
+    return _acknowledgement(row)
+
+
+@router.get("/history", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
+def list_attention_history(
+    runtime: RuntimeDep,
+    cache: FieldCacheDep,
+    reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
+    heliostat: Annotated[Name | None, Query(description="Only this heliostat.")] = None,
+    limit: Limit = 100,
+    after: After = None,
+) -> Page[AlertHistoryOut]:
+    """List alerts that are or were present, the newest first."""
+    rows = read_history(runtime, cache, limit + 1, after, AlertFilter(reason, None, heliostat))
+    return page([_history(row) for row in rows], limit)
+
+
+def _acknowledgement(row: AcknowledgementBatch) -> AcknowledgementOut:
+    return from_row(AcknowledgementOut, row, reason=row.comment, alerts=row.reasons)
+
+
+def _history(entry: AlarmHistory) -> AlertHistoryOut:
+    made = [
+        from_row(AcknowledgementOut, row, id=row.batch, reason=row.comment, alerts={row.reason: 1})
+        for row in entry.acknowledgements
+    ]
+    severity = REASONS[cast(Reason, entry.row.reason)].severity
+    return from_row(
+        AlertHistoryOut,
+        entry.row,
+        heliostat=entry.heliostat,
+        severity=severity,
+        acknowledgements=made,
+    )

@@ -1,14 +1,24 @@
-"""Page of alerts: what is wrong, since when, what to do, and who acknowledged it."""
+"""Pages of alerts: what is wrong, since when, what to do, who acknowledged it, and the history."""
 
-from collections import Counter
-from typing import Annotated
+from operator import attrgetter
+from typing import Annotated, Literal, Self, get_args
+from urllib.parse import urlencode
 
-from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from service.base.fields import Model
-from service.twin.alerts.alerts import acknowledge, list_alerts
+from service.base.errors import ConflictError
+from service.base.fields import Model, Name, Text, Version, drop_empty_fields
+from service.store import acknowledgements
+from service.twin.alerts.acknowledging import (
+    AlertFilter,
+    acknowledge,
+    group_alerts,
+    read_history,
+    undo_acknowledgement,
+)
+from service.twin.alerts.alerts import Alert, list_alerts
 from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason
 from service.web.api.attention import AttentionCountDep, ItemId
 from service.web.auth.dependencies import (
@@ -23,41 +33,118 @@ from service.web.responses.pages import count_badge, go_to, render
 
 router = APIRouter(include_in_schema=False)
 
-# Items on the page, in total or for one reason.
+# Alerts that the page lists of one reason, or in total if it is sorted otherwise.
 _LISTED = 100
+
+# Acknowledgements that the history lists.
+_BATCHES = 30
+
+Comment = Literal[
+    "Work is ordered",
+    "Known; it can wait",
+    "Follows from another alarm",
+    "Maintenance",
+    "False alarm",
+    "Other",
+]
+COMMENTS: tuple[Comment, ...] = get_args(Comment)
+"""Reasons to choose from; the last one needs words."""
+
+Sort = Literal["severity", "newest", "oldest", "heliostat"]
+
+
+class AttentionQuery(Model):
+    """Filters and order of the page. ``done`` is an acknowledgement that was made just now."""
+
+    severity: Annotated[int | None, Field(ge=1, le=3)] = None
+    reason: Reason | None = None
+    heliostat: Name | None = None
+    acknowledged: bool = False
+    sort: Sort = "severity"
+    done: Version | None = None
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+    def link(self, path: str = "/attention", **changes: object) -> str:
+        """The URL of ``path`` with these filters, and with changes."""
+        values = self.model_dump(exclude_defaults=True, exclude={"done"}) | changes
+        defaults = {None, False, "severity"}
+        asked = {
+            name: str(value).lower() if isinstance(value, bool) else value
+            for name, value in values.items()
+            if value not in defaults
+        }
+        return f"{path}?{urlencode(asked)}" if asked else path
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether only some reasons, severities or heliostats are wanted."""
+        return any((self.severity, self.reason, self.heliostat))
+
+    def choose(self, alerts: list[Alert]) -> list[Alert]:
+        """The wanted alerts in the wanted order."""
+        wanted = AlertFilter(self.reason, self.severity, self.heliostat, self.acknowledged)
+        chosen = wanted.choose(alerts)
+        if self.sort == "heliostat":
+            return sorted(chosen, key=lambda alert: alert.heliostat or "")
+        if self.sort == "severity":
+            return chosen
+        return sorted(chosen, key=attrgetter("since"), reverse=self.sort == "newest")
 
 
 class AcknowledgementForm(Model):
-    """The buttons for one item or all listed ones. ``reason`` is the list to return to."""
+    """The ticked alerts and groups, and why they are acknowledged."""
 
-    ids: Annotated[list[ItemId], Field(min_length=1, max_length=_LISTED)]
-    reason: Reason | None = None
+    ids: Annotated[list[ItemId], Field(default_factory=list, max_length=500)]
+    groups: Annotated[
+        list[Annotated[Text, Field(max_length=80)]], Field(default_factory=list, max_length=100)
+    ]
+    why: Comment
+    words: Annotated[Text, Field(max_length=160)] = ""
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        if not (self.ids or self.groups):
+            raise ValueError("ids: tick at least one alarm, or all of a reason")
+        if not self.comment:
+            raise ValueError(f"words: write the reason if it is {self.why!r}")
+        return self
+
+    @property
+    def comment(self) -> str:
+        """The reason as it is stored."""
+        if self.why == COMMENTS[-1]:
+            return self.words
+        return f"{self.why}: {self.words}" if self.words else self.why
 
 
 @router.get("/attention", dependencies=[READ, OVERVIEW_SLOT])
 def get_attention_page(
     request: Request,
+    query: Annotated[AttentionQuery, Query()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    reason: Annotated[Reason | None, Query()] = None,
-    acknowledged: Annotated[bool, Query()] = False,
 ) -> HTMLResponse:
-    """Alerts that are not acknowledged, or those that are; of one reason or of all."""
+    """Alerts that are not acknowledged, or those that are, by severity and reason or in a list."""
     with runtime.database.reading() as session:
         items, pending = list_alerts(session, cache, runtime.settings)
-    chosen = [item for item in items if (item.acknowledged_by is not None) == acknowledged]
-    listed = [item for item in chosen if reason in (None, item.reason)]
+        done = query.done and acknowledgements.list_batches(session, 1, number=query.done)
+    chosen = query.choose(items)
+    groups = group_alerts(chosen)
     return render(
         request,
         "attention.html",
+        query=query,
         reasons=REASONS,
         severities=SEVERITIES,
-        counts=Counter(item.reason for item in chosen),
-        others=len(items) - len(chosen),
-        listed=listed[:_LISTED],
-        more=max(0, len(listed) - _LISTED),
-        reason=reason,
-        acknowledged=acknowledged,
+        comments=COMMENTS,
+        groups=groups if query.sort == "severity" else [],
+        chosen=chosen,
+        listed=_LISTED if query.reason is None else 5 * _LISTED,
+        others=sum((item.acknowledged_by is not None) != query.acknowledged for item in items),
+        done=done[0] if done else None,
         pending=pending,
         limits=runtime.settings,
     )
@@ -71,13 +158,63 @@ def get_attention_count(count: AttentionCountDep) -> Response:
 
 @router.post("/attention/acknowledgements", dependencies=[OPERATE])
 def post_acknowledgement_form(
+    query: Annotated[AttentionQuery, Query()],
     form: Annotated[AcknowledgementForm, Form()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
     count: AttentionCountDep,
     identity: IdentityDep,
 ) -> Response:
-    """Acknowledge items, and return to the list."""
-    acknowledge(runtime, cache, form.ids, identity.name)
+    """Acknowledge the ticked alerts and groups with one reason, and return to the list."""
+    ids = dict.fromkeys(form.ids)
+    with runtime.database.reading() as session:
+        items = list_alerts(session, cache, runtime.settings).alerts
+    groups = {group.token: group.alerts for group in group_alerts(query.choose(items))}
+    for token in form.groups:
+        if token not in groups:
+            name = token.partition(":")[0].replace("_", " ")
+            raise ConflictError(
+                f"groups: the alarms of {name} changed since the page was opened; look at them"
+                " again"
+            )
+        ids |= dict.fromkeys(alert.id for alert in groups[token])
+    done = acknowledge(runtime, cache, list(ids), identity.name, form.comment)
     count.forget()
-    return go_to("/attention" if form.reason is None else f"/attention?reason={form.reason}")
+    return go_to(query.link(done=done[0].acknowledgement))
+
+
+@router.post("/attention/acknowledgements/{number}/undo", dependencies=[OPERATE])
+def post_undo_form(
+    number: Annotated[Version, Path(description="Number of the acknowledgement.")],
+    runtime: RuntimeDep,
+    count: AttentionCountDep,
+    identity: IdentityDep,
+    page: Annotated[Literal["attention", "history"], Query()] = "attention",
+) -> Response:
+    """Undo an acknowledgement, and return to the page."""
+    undo_acknowledgement(runtime, number, identity.name)
+    count.forget()
+    return go_to("/attention" if page == "attention" else "/attention/history")
+
+
+@router.get("/attention/history", dependencies=[READ, OVERVIEW_SLOT])
+def get_attention_history_page(
+    request: Request,
+    runtime: RuntimeDep,
+    cache: FieldCacheDep,
+    after: Annotated[Version | None, Query()] = None,
+) -> HTMLResponse:
+    """Acknowledgements with their reasons, and alerts that are or were present."""
+    rows = read_history(runtime, cache, _LISTED + 1, after)
+    with runtime.database.reading() as session:
+        batches = acknowledgements.list_batches(session, _BATCHES)
+    return render(
+        request,
+        "attention_history.html",
+        reasons=REASONS,
+        severities=SEVERITIES,
+        batches=[] if after else batches,
+        rows=rows[:_LISTED],
+        older=rows[_LISTED - 1].row.id if len(rows) > _LISTED else None,
+        after=after,
+    )

@@ -57,6 +57,8 @@ PATHS = (
     "/forecasts/1",
     "/studies",
     "/attention",
+    "/attention?sort=newest",
+    "/attention/history",
     "/calibration-plan?at=2026-06-21T10:00",
     "/studies/1",
     "/jobs",
@@ -269,12 +271,14 @@ def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dic
     page.goto("/")
     expect(page.locator("nav .count")).to_have_text("1 not acknowledged")
     follow(page, "text=Alarms")
-    expect(page.locator(".attention li")).to_contain_text("None was ever accepted.")
-    follow(page, ".attention li button")
+    expect(page.locator(".alarms tbody tr")).to_contain_text("None was ever accepted.")
+    page.check("[name=ids]")
+    page.select_option("[name=why]", "Maintenance")
+    follow(page, ".acknowledging button")
     expect(page.locator("#attention")).to_contain_text("Nothing.")
     expect(page.locator("nav .count")).to_have_count(0)
     follow(page, "text=Acknowledged (1)")
-    expect(page.locator(".attention li")).to_contain_text("acknowledged by local")
+    expect(page.locator(".alarms tbody tr")).to_contain_text("acknowledged by local")
 
 
 # All rules of axe-core; it counts WCAG 2.5.3 (names contain visible texts) as experimental.

@@ -106,7 +106,7 @@ def test_changed_camera_needs_attention_without_a_study(app: FastAPI, client: Te
         in client.get("/metrics").text
     )
     assert "On lower the sheet&#39;s own pattern is " in client.get("/attention", headers=HTML).text
-    client.post("/v1/attention/acknowledgements", json={"ids": [item["id"]]})
+    client.post("/v1/attention/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
     assert of_camera(client)[0]["acknowledged_by"] == "local"
 
 

@@ -89,7 +89,9 @@ def test_pages_and_attention_say_that_it_is_a_candidate(predicted: TestClient):
     assert "version 1 is a candidate" in predicted.get("/", headers=HTML).text
     flagged = {item["heliostat"]: item for item in predicted.get("/v1/attention").json()["items"]}
     assert flagged["AB38"]["reason"] == "untrusted"
-    seen = predicted.post("/v1/attention/acknowledgements", json={"ids": [flagged["AB38"]["id"]]})
+    seen = predicted.post(
+        "/v1/attention/acknowledgements", json={"ids": [flagged["AB38"]["id"]], "reason": "seen"}
+    )
     assert seen.status_code == 200, seen.text
     assert predicted.get("/v1/heliostats/AB38/surfaces/1").json()["acknowledged_by"] == "local"
 

@@ -73,6 +73,8 @@ PATHS = (
     "/studies/1",
     "/attention",
     "/attention?acknowledged=true",
+    "/attention?sort=newest",
+    "/attention/history",
     "/compare",
     "/plans",
     "/compare?heliostat=AA39",

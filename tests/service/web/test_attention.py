@@ -3,6 +3,7 @@ as metrics.
 """
 
 import itertools
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -23,7 +24,7 @@ from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
-from service.twin.alerts.alerts import AlertCount
+from service.twin.alerts.counts import AlertCount
 from service.twin.alerts.reasons import REASONS, Reason
 from service.twin.surfaces.accuracy import accuracy_drop
 from service.web.app import create_app
@@ -71,7 +72,8 @@ def of(client: TestClient, reason: str) -> list[dict[str, Any]]:
 
 
 def acknowledge(client: TestClient, *found: dict[str, Any]) -> Any:
-    return client.post(f"{PATH}/acknowledgements", json={"ids": [item["id"] for item in found]})
+    body = {"ids": [item["id"] for item in found], "reason": "seen"}
+    return client.post(f"{PATH}/acknowledgements", json=body)
 
 
 def recent() -> dict[str, Any]:
@@ -401,18 +403,115 @@ def test_page_and_menu_show_alerts_and_forms_acknowledge_them(stale: TestClient)
     assert stale.get("/attention/count").text.startswith('<span class="count">3<')
     assert 'hx-get="/attention/count"' in page
     one, two, three = (item["id"] for item in items(stale))
-    form = {"ids": [one], "reason": "no_photograph"}
-    answer = stale.post(
-        "/attention/acknowledgements", data=form, headers=HTML, follow_redirects=False
-    )
-    assert (answer.status_code, answer.headers["Location"]) == (
-        303,
-        "/attention?reason=no_photograph",
-    )
+    path = "/attention/acknowledgements?reason=no_photograph"
+    form: dict[str, Any] = {"ids": [one], "why": "Maintenance", "words": "row A"}
+    answer = stale.post(path, data=form, headers=HTML, follow_redirects=False)
+    assert answer.status_code == 303
+    assert re.fullmatch(r"/attention\?reason=no_photograph&done=\d+", answer.headers["Location"])
+    page = stale.get(answer.headers["Location"], headers=HTML).text
+    assert "1 acknowledged by local: Maintenance: row A" in page
     assert stale.get("/attention/count").text.startswith('<span class="count">2<')
-    stale.post("/attention/acknowledgements", data={"ids": [two, three]}, headers=HTML)
+    form = {"ids": [two, three], "why": "Other", "words": "cloudy month"}
+    stale.post("/attention/acknowledgements", data=form, headers=HTML)
     assert "Nothing." in stale.get("/attention", headers=HTML).text
     assert "local, " in stale.get("/attention?acknowledged=true", headers=HTML).text
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"why": "Maintenance"}, "tick at least one alarm"),
+        ({"groups": "no_photograph:0123456789ab", "why": "Maintenance"}, "changed since"),
+        ({"groups": "no_photograph:0123456789ab", "why": "Other"}, "write the reason"),
+        ({"groups": "no_photograph:0123456789ab", "why": ""}, "why"),
+    ],
+)
+def test_acknowledging_needs_alarms_and_a_reason(
+    refusing: TestClient, form: dict[str, str], message: str
+):
+    answer = refusing.post("/attention/acknowledgements", data=form, headers=HTML)
+    assert answer.status_code in (409, 422)
+    assert message in answer.text
+
+
+def test_group_is_acknowledged_with_a_reason_and_undone(stale: TestClient):
+    page = stale.get("/attention", headers=HTML).text
+    (token,) = re.findall(r'name="groups" value="(\S+)"', page)
+    form = {"groups": token, "why": "Follows from another alarm"}
+    stale.post("/attention/acknowledgements", data=form, headers=HTML)
+    seen = items(stale)
+    assert {item["acknowledged_reason"] for item in seen} == {"Follows from another alarm"}
+    (batch,) = stale.get(f"{PATH}/acknowledgements").json()["items"]
+    assert (batch["made_by"], batch["alerts"]) == ("local", {"no_photograph": 3})
+    assert {item["acknowledgement"] for item in seen} == {batch["id"]}
+    undo = f"{PATH}/acknowledgements/{batch['id']}/undo"
+    assert stale.post(undo).json()["undone_by"] == "local"
+    assert len(items(stale, acknowledged=False)) == 3
+    assert "was undone by local" in stale.post(undo).text
+    assert stale.post(f"{PATH}/acknowledgements/99/undo").status_code == 404
+    # Again, and undone on the page.
+    acknowledge(stale, *items(stale))
+    assert items(stale, acknowledged=False) == []
+    newest = stale.get(f"{PATH}/acknowledgements", params={"limit": 1}).json()["items"][0]
+    answer = stale.post(f"/attention/acknowledgements/{newest['id']}/undo?page=history")
+    assert "Follows from another alarm" in answer.text
+    assert len(items(stale, acknowledged=False, heliostat="a-1")) == 1
+
+
+def test_history_of_alarms(app: FastAPI, client: TestClient, post: Post):
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=365)))
+    (item,) = items(client)
+    acknowledge(client, item)
+    post(png(1), **recent())
+    (entry,) = client.get(f"{PATH}/history", params={"heliostat": "AA39"}).json()["items"]
+    assert (entry["reason"], entry["severity"], entry["since"]) == (
+        "no_photograph",
+        3,
+        item["since"],
+    )
+    assert entry["opened_at"] < entry["closed_at"]
+    assert [(one["made_by"], one["reason"]) for one in entry["acknowledgements"]] == [
+        ("local", "seen")
+    ]
+    page = client.get("/attention/history", headers=HTML).text
+    assert 'href="/attention/history"' in client.get("/attention", headers=HTML).text
+    assert "None was ever accepted" not in page
+    assert "none was ever accepted" in page
+    # The menu's count records, too.
+    with app.state.runtime.database.writing() as session:
+        session.execute(update(MeasurementRow).values(taken_at=now() - timedelta(days=50)))
+    app.state.attention.forget()
+    assert client.get("/attention/count").text.startswith('<span class="count">1<')
+    present = client.get(f"{PATH}/history", params={"limit": 1}).json()
+    assert present["items"][0]["closed_at"] is None
+    assert present["next"] is not None
+
+
+def test_undo_of_acknowledged_warnings_of_a_surface(tmp_path: Path):
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), Doubter())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        poster(client)(png(2), id="2", sun=sun_at(90.0))
+        client.post("/v1/heliostats/AA39/surfaces", json={"method": "network"})
+        (seen,) = acknowledge(client, *of(client, "untrusted")).json()["items"]
+        client.post(f"{PATH}/acknowledgements/{seen['acknowledgement']}/undo")
+        assert client.get("/v1/heliostats/AA39/surfaces/1").json()["acknowledged_by"] is None
+        assert of(client, "untrusted")[0]["acknowledged_by"] is None
+
+
+def test_filters_and_orders_of_the_page(stale: TestClient):
+    def shown(**query: Any) -> list[str]:
+        page = stale.get("/attention", params=query, headers=HTML).text
+        return re.findall(r'<th scope="row"><a href="/heliostats/([^"]+)"', page)
+
+    assert shown() == shown(severity=3, reason="no_photograph") == ["AA39", "AB01", "a-1"]
+    assert shown(severity=1) == shown(heliostat="ZZ99") == shown(acknowledged=True) == []
+    assert shown(sort="heliostat", heliostat="") == ["AA39", "AB01", "a-1"]
+    assert shown(heliostat="AB01", sort="newest") == ["AB01"]
+    page = stale.get("/attention?sort=newest&severity=3", headers=HTML).text
+    assert 'href="/attention?severity=3&amp;sort=oldest">Since' in page
+    assert 'aria-sort="descending"' in page
 
 
 def test_who_acknowledged_is_the_key_and_audited(app: FastAPI, client: TestClient):
@@ -424,7 +523,7 @@ def test_who_acknowledged_is_the_key_and_audited(app: FastAPI, client: TestClien
     client.headers["Authorization"] = f"Bearer {reader}"
     (item,) = items(client)
     assert acknowledge(client, item).status_code == 403
-    assert "Acknowledge</button>" not in client.get("/attention", headers=HTML).text
+    assert '<h2 id="acknowledging-title' not in client.get("/attention", headers=HTML).text
     client.headers["Authorization"] = f"Bearer {operator}"
     assert acknowledge(client, item).json()["items"][0]["acknowledged_by"] == "shift-2"
     with database.reading() as session:
@@ -439,7 +538,16 @@ def test_who_acknowledged_is_the_key_and_audited(app: FastAPI, client: TestClien
 
 
 @pytest.mark.parametrize(
-    "body", [{}, {"ids": []}, {"ids": ["AA39"]}, {"ids": [1]}, {"ids": ["x:y:0"] * 501}]
+    "body",
+    [
+        {},
+        {"ids": [], "reason": "seen"},
+        {"ids": ["AA39"], "reason": "seen"},
+        {"ids": [1], "reason": "seen"},
+        {"ids": ["x:y:0"] * 501, "reason": "seen"},
+        {"ids": ["AA39:moved:01234567"]},
+        {"ids": ["AA39:moved:01234567"], "reason": ""},
+    ],
 )
 def test_acknowledgement_of_nothing_is_refused(refusing: TestClient, body: dict[str, Any]):
     assert refusing.post(f"{PATH}/acknowledgements", json=body).status_code == 422

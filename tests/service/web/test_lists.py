@@ -55,6 +55,8 @@ def test_every_list_is_a_page(bare: TestClient):
         "jobs",
         "models",
         "attention",
+        "attention/acknowledgements",
+        "attention/history",
         "audit",
     ):
         assert f"/v1/{name}" in pages
