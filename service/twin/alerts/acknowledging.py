@@ -58,10 +58,14 @@ class AlertGroup:
         return len(self.alerts)
 
     @property
-    def since(self) -> tuple[datetime, datetime]:
-        """Since when the oldest and the newest alert last."""
-        moments = [alert.since for alert in self.alerts]
-        return min(moments), max(moments)
+    def first(self) -> datetime:
+        """Since when the oldest alert lasts."""
+        return min(alert.since for alert in self.alerts)
+
+    @property
+    def last(self) -> datetime:
+        """Since when the newest alert lasts."""
+        return max(alert.since for alert in self.alerts)
 
     @property
     def token(self) -> str:
@@ -108,7 +112,8 @@ def acknowledge(
         rows = acknowledgements.acknowledge(session, [item.key for item in chosen], actor, comment)
         for item in chosen:
             if item.reason == "untrusted":
-                heliostat, surface = _flagged_surface(session, item.heliostat)
+                heliostat = store.get_heliostat(session, item.heliostat or "")
+                surface = _flagged_surface(session, heliostat)
                 decisions.acknowledge_warnings(session, heliostat, surface, actor)
     return [item.with_acknowledgement(row) for item, row in zip(chosen, rows, strict=True)]
 
@@ -118,15 +123,15 @@ def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:
     with runtime.database.writing() as session:
         for key in acknowledgements.undo(session, batch, actor):
             if key.reason == "untrusted":
-                heliostat, surface = _flagged_surface(session, key.heliostat)
+                heliostat = store.get_heliostat(session, key.heliostat or "")
+                surface = _flagged_surface(session, heliostat)
                 decisions.forget_acknowledgement(session, heliostat, surface, actor)
 
 
-def _flagged_surface(session: Session, name: str | None) -> tuple[HeliostatRow, SurfaceRow]:
-    """The heliostat and its surface that the alert "untrusted" is about."""
-    heliostat = store.get_heliostat(session, name or "")
+def _flagged_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow:
+    """The surface that the alert "untrusted" is about."""
     candidate = store.find_candidate(session, heliostat)
-    return heliostat, candidate or store.get_surface_at(session, heliostat)
+    return candidate or store.get_surface_at(session, heliostat)
 
 
 def record_history(runtime: Runtime, found: AlertList) -> None:
