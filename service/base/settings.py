@@ -420,6 +420,9 @@ class AttentionSettings(_SettingsGroup):
     attention_accuracy_drop: float = Field(0.05, ge=0, le=1)
     """By how much more than this the accuracy of a heliostat's newest photographs must have fallen
     [1], surely (95 %), for it to need attention."""
+    attention_light_loss: float = Field(0.2, gt=0, lt=1)
+    """The same for the share of light that its newest photographs have lost, compared with other
+    heliostats on the same days [1]."""
     attention_pointing_mrad: float = Field(3.0, gt=0, le=1000)
     """Pointing error above which it does [mrad]."""
     attention_moved_days: Days = 90.0

@@ -105,7 +105,7 @@ class Fault:
 
 
 FAULTS = (
-    Fault("soiled", ("R03-05",), (13, 0), 0.45, None),
+    Fault("soiled", ("R03-05",), (11, 0), 0.45, "dimmed"),
     Fault("drives stepped", ("R04-09",), (9, 0), 9.0, "moved"),
     Fault("facet canted", ("R04-12",), (11, 0), 6.0, "fell"),
     Fault("hazy", (), (20, 14), 0.35, None),

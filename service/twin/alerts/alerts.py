@@ -43,6 +43,7 @@ from service.twin.alerts.field_overview import (
     FieldOverviewCache,
     HeliostatOverview,
 )
+from service.twin.alerts.light import LostLight, find_lost_light
 from service.twin.alerts.reasons import REASONS, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans
 from service.twin.plant import model_versions
@@ -109,8 +110,9 @@ def list_alerts(session: Session, cache: FieldOverviewCache, settings: Settings)
 
     def read_alerts() -> AlertList:
         field, cameras = cache.read(session, PATIENCE_S), cache.cameras.changes(session, settings)
+        lost = find_lost_light(cache.cameras.light(session), settings.attention_light_loss)
         return AlertList(
-            alerts_of_heliostats(session, field.lines, settings, cameras), field.pending
+            alerts_of_heliostats(session, field.lines, settings, cameras, lost), field.pending
         )
 
     return cache.recent(session, "attention", read_alerts)
@@ -121,6 +123,7 @@ def alerts_of_heliostats(
     lines: Sequence[HeliostatOverview],
     settings: Settings,
     cameras: Sequence[CameraChange],
+    lost_light: Sequence[LostLight] = (),
 ) -> list[Alert]:
     """List the alerts of the plant, its cameras and its heliostats.
 
@@ -136,7 +139,7 @@ def alerts_of_heliostats(
     ]
     found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
-    found += _warned(session)
+    found += [*_warned(session), *_dimmed(session, lost_light, settings)]
     for line in lines:
         found += _of_heliostat(line, settings, at)
     known = acknowledgements.acknowledged(session)
@@ -349,6 +352,26 @@ def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alert]:
         action = "look for what changed on its mirror, and predict its surface again"
         yield Alert(
             "fell", name, since, message, action, _fingerprint(since, drop / max(allowed, 1e-6))
+        )
+
+
+def _dimmed(
+    session: Session, lost_light: Sequence[LostLight], settings: Settings
+) -> Iterator[Alert]:
+    """Report heliostats that lost light."""
+    numbers = [one.heliostat for one in lost_light]
+    query = select(HeliostatRow.id, HeliostatRow.name).where(HeliostatRow.id.in_(numbers))
+    names: dict[int, str] = {row.id: row.name for row in session.execute(query)}
+    for lost in lost_light:
+        yield Alert(
+            "dimmed",
+            names[lost.heliostat],
+            lost.since,
+            f"its newest {lost.photographs} photographs on {lost.target} have {lost.share:.0%} less"
+            f" light than before, compared with other heliostats on the same days; by"
+            f" {lost.min_share:.0%} at least, and {settings.attention_light_loss:.0%} is allowed",
+            "look whether its mirror is dirty, covered or broken, and whether others shade it",
+            _fingerprint(lost.since, lost.min_share / settings.attention_light_loss),
         )
 
 

@@ -5,12 +5,14 @@ heliostats. Clouds, distances and spots differ from photograph to photograph. Th
 days are compared, relative to how much days differ.
 """
 
+import math
 import threading
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from datetime import time as clock
+from typing import NamedTuple
 
 import numpy as np
 from cachetools import TTLCache
@@ -30,12 +32,29 @@ FIGURES = {
 """Quality figures that a camera changes (`model.imaging.quality.Quality`), with labels."""
 
 _WINDOW_DAYS = 90
+_WITH_SHEET = ("raw", "cropped")  # kinds of images with the sheet's light, to compare the spot's
 _MAX_A_DAY = 200  # photographs of a day that are read, the last ones
 _HOLDS_S = 6 * 3600.0  # time that earlier days are cached, because few photographs are re-measured
 _MIN_SPREAD = 0.05  # least spread between days, even if few days happen to agree
 # 1.4826 converts a median deviation to a standard deviation. 1.2533 is the standard deviation of a
 # median over that of a mean.
 _OF_DEVIATION, _OF_MEDIAN = 1.4826, 1.2533
+
+class LightReading(NamedTuple):
+    """Light of a photograph: the logarithm of the spot over the sheet."""
+
+    heliostat: int
+    target: str
+    taken_at: datetime
+    light: float
+
+
+class _DayFigures(NamedTuple):
+    """Medians of a day by target, and the light of its photographs."""
+
+    medians: dict[str, NDArray[np.float64]]
+    light: list[LightReading]
+
 
 Daily = Mapping[date, NDArray[np.float64]]
 """Logarithms of `FIGURES` (3,), as medians of each day."""
@@ -81,44 +100,50 @@ def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraC
     return max(found, key=lambda change: change.certainty, default=None)
 
 
-def _of_day(session: Session, day: date) -> dict[str, NDArray[np.float64]]:
-    """Medians of a day by target, over its last accepted photographs."""
+def _of_day(session: Session, day: date) -> _DayFigures:
+    """Figures of a day, over its last accepted photographs."""
     begin = datetime.combine(day, clock(), UTC)
     row = MeasurementRow
-    query = select(TargetRow.name, row.quality).join(TargetRow, TargetRow.id == row.target_id)
-    query = query.where(
+    query = select(row.heliostat_id, TargetRow.name, row.taken_at, row.kind, row.quality)
+    query = query.join(TargetRow, TargetRow.id == row.target_id).where(
         row.accepted, row.taken_at >= begin, row.taken_at < begin + timedelta(days=1)
     )
     found: dict[str, list[list[float]]] = defaultdict(list)
-    for name, quality in session.execute(
+    light = []
+    for heliostat, name, taken_at, kind, quality in session.execute(
         query.order_by(row.taken_at.desc(), row.id.desc()).limit(_MAX_A_DAY)
     ):
         figures = [quality.get(figure) or 0.0 for figure in FIGURES]
         if min(figures) > 0:
             found[name].append(figures)
-    return {name: np.median(np.log(figures), axis=0) for name, figures in found.items()}
+            if kind in _WITH_SHEET:
+                light.append(LightReading(heliostat, name, taken_at, math.log(figures[0])))
+    medians = {name: np.median(np.log(figures), axis=0) for name, figures in found.items()}
+    return _DayFigures(medians, light)
 
 
 class CameraWatch:
-    """Daily medians of all targets, cached except for the current day."""
+    """Daily figures of all targets, cached except for the current day."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._days: TTLCache[date, dict[str, NDArray[np.float64]]] = TTLCache(
-            2 * _WINDOW_DAYS, _HOLDS_S
-        )
+        self._days: TTLCache[date, _DayFigures] = TTLCache(2 * _WINDOW_DAYS, _HOLDS_S)
 
     def changes(self, session: Session, settings: Settings) -> list[CameraChange]:
         """Camera changes, in the order of target names."""
         days = self._read(session, now().date())
         daily: dict[str, dict[date, NDArray[np.float64]]] = defaultdict(dict)
         for day, of in days.items():
-            for name, medians in of.items():
+            for name, medians in of.medians.items():
                 daily[name][day] = medians
         found = (find_camera_change(name, daily[name], settings) for name in sorted(daily))
         return [change for change in found if change is not None]
 
-    def _read(self, session: Session, today: date) -> dict[date, dict[str, NDArray[np.float64]]]:
+    def light(self, session: Session) -> list[LightReading]:
+        """Light of the photographs of all days, the newest day first."""
+        return [one for day in self._read(session, now().date()).values() for one in day.light]
+
+    def _read(self, session: Session, today: date) -> dict[date, _DayFigures]:
         days = {}
         with self._lock:
             for day in (today - timedelta(days=ago) for ago in range(_WINDOW_DAYS)):

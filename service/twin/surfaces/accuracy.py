@@ -380,9 +380,9 @@ class AccuracyDrop:
     high: float
 
 
-# The median of the `_NEWEST` newest photographs is compared with the median of those before: at
-# least `_NEWEST`, at most `_BEFORE`.
-_NEWEST = 5
+RECENT_MEDIAN = 5
+"""Newest photographs whose median is compared with that of those before, of at least as many."""
+
 _BEFORE = 60
 _DRAWS = 1000
 
@@ -393,9 +393,9 @@ def accuracy_drop(accuracies: Sequence[float]) -> AccuracyDrop | None:
     The interval is a bootstrap interval: Efron and Tibshirani 1993, *An Introduction to the
     Bootstrap*, chapter 13.
     """
-    recent = np.array(accuracies[:_NEWEST])
-    earlier = np.array(accuracies[_NEWEST : _NEWEST + _BEFORE])
-    if len(earlier) < _NEWEST:
+    recent = np.array(accuracies[:RECENT_MEDIAN])
+    earlier = np.array(accuracies[RECENT_MEDIAN : RECENT_MEDIAN + _BEFORE])
+    if len(earlier) < RECENT_MEDIAN:
         return None
     drop = bootstrap(
         (earlier, recent), _drop, n_resamples=_DRAWS, method="percentile", rng=0
@@ -421,7 +421,7 @@ def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
         row.heliostat_id == heliostat, row.accepted, row.forecast_accuracy.is_not(None)
     )
     query = query.where(row.taken_at.is_not(None)).order_by(row.taken_at.desc(), row.id.desc())
-    query = query.limit(len(PREFERENCE) * (_NEWEST + _BEFORE))
+    query = query.limit(len(PREFERENCE) * (RECENT_MEDIAN + _BEFORE))
     shots: dict[str, tuple[int, float]] = {}
     for name, kind, accuracy in session.execute(query):
         shots[name] = min(
@@ -433,7 +433,7 @@ def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
 def usual_accuracy(session: Session, heliostat: int) -> float | None:
     """Median accuracy [1] on arrival of a heliostat's photographs; None for fewer than five."""
     accuracies = _accuracies_on_arrival(session, heliostat)
-    return float(np.median(accuracies)) if len(accuracies) >= _NEWEST else None
+    return float(np.median(accuracies)) if len(accuracies) >= RECENT_MEDIAN else None
 
 
 def record_drift(

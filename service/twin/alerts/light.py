@@ -1,0 +1,110 @@
+"""Find heliostats that send less light than before, compared with the others on the same days.
+
+The light of a photograph depends on the heliostat, on the day (haze, exposure) and on what changed
+on the mirror. Medians of heliostats and of days are removed in turn (Tukey 1977, *Exploratory Data
+Analysis*, chapter 11), so that a change of one heliostat is left.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.twin.studies.camera_watch import LightReading
+from service.twin.surfaces.accuracy import RECENT_MEDIAN, accuracy_drop
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 3  # of medians of heliostats and of days
+_MIN_HELIOSTATS = 3  # of which one can be compared with the others
+
+
+@dataclass(frozen=True)
+class LostLight:
+    """Light that a heliostat lost, compared with the others.
+
+    Attributes
+    ----------
+    heliostat : int
+        Its row id.
+    target : str
+    since : datetime
+        Of the first photograph with less light.
+    share, min_share : float [1]
+        Lost share of the light, and the lower end of its 95 % interval.
+    photographs : int
+        With less light.
+    """
+
+    heliostat: int
+    target: str
+    since: datetime
+    share: float
+    min_share: float
+    photographs: int
+
+
+def find_lost_light(readings: Iterable[LightReading], allowed: float) -> list[LostLight]:
+    """Heliostats whose newest photographs surely lost more than the ``allowed`` share of light."""
+    by_target: dict[str, list[LightReading]] = defaultdict(list)
+    for reading in readings:
+        by_target[reading.target].append(reading)
+    limit, found = -math.log1p(-allowed), []
+    for some in by_target.values():
+        of_heliostat: dict[int, list[tuple[datetime, float]]] = defaultdict(list)
+        for reading, left in zip(some, _without_days(some).tolist(), strict=True):
+            of_heliostat[reading.heliostat].append((reading.taken_at, left))
+        if len(of_heliostat) < _MIN_HELIOSTATS:
+            continue
+        for heliostat, dated in of_heliostat.items():
+            lost = _lost(heliostat, some[0].target, sorted(dated, reverse=True), limit)
+            if lost is not None:
+                found.append(lost)
+    return found
+
+
+def _without_days(readings: list[LightReading]) -> Array:
+    """Light (N,) of a target's photographs, without the typical light of each day."""
+    light = np.array([one.light for one in readings])
+    left = light.copy()
+    day_part = np.zeros_like(light)
+    for _ in range(_ROUNDS):
+        left -= _medians(readings, left, lambda one: one.heliostat)
+        part = _medians(readings, left, lambda one: one.taken_at.date())
+        left -= part
+        day_part += part
+    return np.asarray(light - day_part)
+
+
+def _medians(
+    readings: list[LightReading], values: Array, key: Callable[[LightReading], Hashable]
+) -> Array:
+    """For each of N readings the median of the ``values`` (N,) with the same key."""
+    places: dict[Hashable, list[int]] = defaultdict(list)
+    for place, reading in enumerate(readings):
+        places[key(reading)].append(place)
+    medians = np.empty_like(values)
+    for some in places.values():
+        medians[some] = np.median(values[some])
+    return medians
+
+
+def _lost(
+    heliostat: int, target: str, dated: list[tuple[datetime, float]], limit: float
+) -> LostLight | None:
+    """The light that was lost, by times and light from the newest on; None if less than allowed."""
+    values = [value for _, value in dated]
+    recent, earlier = values[:RECENT_MEDIAN], values[RECENT_MEDIAN:]
+    if not earlier or np.median(earlier) - np.median(recent) <= limit:
+        return None  # most end here, without a bootstrap
+    drop = accuracy_drop(values)
+    if drop is None or drop.low <= limit:
+        return None
+    half = (drop.earlier + drop.recent) / 2
+    count = next((place for place, value in enumerate(values) if value > half), len(values))
+    share, least = (-math.expm1(-size) for size in (drop.earlier - drop.recent, drop.low))
+    return LostLight(heliostat, target, dated[max(count, 1) - 1][0], share, least, max(count, 1))
