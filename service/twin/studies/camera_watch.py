@@ -40,6 +40,7 @@ _MIN_SPREAD = 0.05  # least spread between days, even if few days happen to agre
 # median over that of a mean.
 _OF_DEVIATION, _OF_MEDIAN = 1.4826, 1.2533
 
+
 class LightReading(NamedTuple):
     """Light of a photograph: the logarithm of the spot over the sheet."""
 
