@@ -1,6 +1,6 @@
 """What work would cost before it starts, from the durations of earlier jobs of its kind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -9,6 +9,7 @@ from statistics import median
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from model.effects import CATALOGUE
 from service.base.fields import Method
 from service.jobs.kinds.predictions import EACH_S
 from service.store.job_tables import JobRow
@@ -17,8 +18,9 @@ from service.store.tables import HeliostatRow, MeasurementRow
 # Newest finished jobs of a kind that are read.
 _READ_JOBS = 10
 
-# Stated durations without earlier jobs [s]: of a heliostat's mount, and of a photograph's import.
-_CALIBRATION_S, _IMPORT_S = 1.0, 0.5
+# Stated durations without earlier jobs [s]: of a heliostat's mount, of a photograph's import, and
+# of one effect tried on a photograph.
+_CALIBRATION_S, _IMPORT_S, _TRIAL_S = 1.0, 0.5, 0.15
 
 _IMAGES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"))
 _MOST_FILES = 100_000
@@ -80,6 +82,23 @@ def calibration_cost(session: Session, heliostat: str | None) -> Cost:
     count = session.scalars(driven).one()
     return _cost(
         session, "calibrations", count, _CALIBRATION_S, lambda row: _results(row, "mounts")
+    )
+
+
+def study_cost(session: Session, n_photographs: int, effects: Sequence[str] | None) -> Cost:
+    """The cost of trying effects, by default all, on photographs."""
+
+    def n_trials(n_photographs: int, effects: Sequence[str] | None) -> int:
+        return n_photographs * len(CATALOGUE if effects is None else effects)
+
+    return _cost(
+        session,
+        "studies",
+        n_trials(n_photographs, effects),
+        _TRIAL_S,
+        lambda row: n_trials(
+            (row.result or {}).get("photographs", 0), row.payload.get("candidates")
+        ),
     )
 
 

@@ -92,6 +92,7 @@ def make_study(context: Context, payload: StudyIn) -> Result:
                 "study": row.id,
                 "verdict": row.verdict,
                 "conclusion": row.conclusion,
+                "photographs": len(studied.material.photographs),
                 "skipped": row.skipped,
             }
             context.keep(session, "study", about)

@@ -118,6 +118,43 @@ def load_study_inputs(session: Session, request: StudyRequest) -> StudyInputs:
     return material
 
 
+@dataclass(frozen=True)
+class StudyExtent:
+    """Numbers of photographs by heliostat that a study would use, and what it would leave out."""
+
+    photographs: dict[str, int]
+    skipped: dict[str, str]
+
+    @property
+    def n_photographs(self) -> int:
+        """Number of all photographs."""
+        return sum(self.photographs.values())
+
+
+def extent_of(session: Session, request: StudyRequest) -> StudyExtent:
+    """Count what a request would study, without loading photographs.
+
+    Raises
+    ------
+    NotFoundError
+        If a named heliostat is not stored.
+    """
+    photographs, skipped = {}, {}
+    for row in _chosen_heliostats(session, request):
+        try:
+            _surface(session, row, request.surfaces)
+            photographs[row.name] = len(_chosen_measurements(session, row, request))
+        except SKIPPED as error:
+            skipped[row.name] = str(error)
+    return StudyExtent(photographs, skipped)
+
+
+def _chosen_measurements(
+    session: Session, row: HeliostatRow, request: StudyRequest
+) -> list[MeasurementRow]:
+    return choose_measurements(session, row, request.images, request.since, request.until)
+
+
 def _chosen_heliostats(session: Session, request: StudyRequest) -> Sequence[HeliostatRow]:
     """The named heliostats, else a selection with photographs and a surface.
 
@@ -157,8 +194,7 @@ def _load_heliostat_inputs(
     surface = _surface(session, row, request.surfaces)
     points = control_points(twin.heliostat, heights_of(surface))
     seen = {m.identifier for m in surface.measurements}
-    chosen = choose_measurements(session, row, request.images, request.since, request.until)
-    names = [found.identifier for found in chosen]
+    names = [found.identifier for found in _chosen_measurements(session, row, request)]
     rows = store.get_measurements(session, row, names, arrays=True)
     add_photographs(session, material, twin, rows, points, seen=seen)
 

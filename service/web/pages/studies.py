@@ -10,9 +10,8 @@ from service import store
 from service.base.errors import ConflictError
 from service.base.fields import CheckedStudyReport, Method, Model, Text, Version
 from service.jobs.enqueuing import enqueue
-from service.jobs.kinds import predictions, studies
+from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
-from service.jobs.kinds.studies import StudyIn
 from service.store.tables import PlantRow
 from service.twin.plant import model_versions
 from service.twin.studies.changes import (
@@ -150,13 +149,6 @@ def get_study_report_page(number: Number, runtime: RuntimeDep) -> HTMLResponse:
     )
     report = study_html(runtime, number).replace(_CRUMB, back, 1)
     return HTMLResponse(report, headers={"Content-Security-Policy": REPORT_POLICY})
-
-
-@router.post("/studies", dependencies=[OPERATE])
-def post_study_form(runtime: RuntimeDep, identity: IdentityDep) -> Response:
-    """Enqueue a study with default settings, and go to the page of the job."""
-    row = enqueue(runtime, studies.KIND, StudyIn(), identity.name)
-    return go_to(f"/jobs/{row.id}")
 
 
 @router.post("/studies/predictions", dependencies=[OPERATE])

@@ -61,6 +61,8 @@ PATHS = (
     "/attention/history",
     "/calibration-plan?at=2026-06-21T10:00",
     "/studies/1",
+    "/studies/1/change",
+    "/studies/new",
     "/jobs",
     "/jobs/start",
     "/jobs/1",

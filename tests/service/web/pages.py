@@ -71,6 +71,7 @@ PATHS = (
     "/jobs/1",
     "/studies",
     "/studies/1",
+    "/studies/new",
     "/attention",
     "/attention?acknowledged=true",
     "/attention?sort=newest",

@@ -491,7 +491,7 @@ def test_reader_sees_no_buttons_and_may_not_press_them(app: FastAPI, pages: Test
     assert "Predict" not in settled(pages)
     assert "Cancel" not in text_of(pages, "/jobs/1")
     assert "forecasts need the role operate" in text_of(pages, "/forecast")
-    assert "Study the photographs" not in text_of(pages, "/studies")
+    assert "New study" not in text_of(pages, "/studies")
     for path in (
         "/forecast",
         "/jobs/predictions",
