@@ -1,4 +1,4 @@
-"""Buttons that choose the active surface, undo the choice, and acknowledge warnings."""
+"""Forms that exclude photographs, choose the active surface, undo that, acknowledge warnings."""
 
 from typing import Annotated
 
@@ -6,10 +6,13 @@ from fastapi import APIRouter, Form, Path, Response
 from pydantic import Field
 
 from service import store
-from service.base.fields import Model, Text, Version
+from service.base.errors import ConflictError
+from service.base.fields import MeasurementName, Model, Reason, Text, Version
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
-from service.web.auth.dependencies import OPERATE, IdentityDep, NamePath, RuntimeDep
+from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.web.api.corrections import predict_again
+from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, IdentityDep, NamePath, RuntimeDep
 from service.web.responses.pages import go_to
 
 router = APIRouter(include_in_schema=False)
@@ -36,6 +39,50 @@ def post_take_form(
         reason = form.reason or f"{identity.name} chose it"
         decisions.promote(session, heliostat, surface, identity.name, Justification(reason))
     return go_to(f"/heliostats/{name}#history-title")
+
+
+@router.post("/heliostats/{name}/surfaces/{version}/keep", dependencies=[OPERATE])
+def post_keep_form(
+    name: NamePath,
+    version: Annotated[Version, Path(description="Number of the version.")],
+    form: Annotated[TakeForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Keep the active surface instead of a candidate."""
+    with runtime.database.writing() as session:
+        heliostat = store.get_heliostat(session, name)
+        surface = store.get_surface(session, heliostat, version)
+        if not surface.is_candidate:
+            raise ConflictError(f"version {version} of {name} is no candidate; reload the page")
+        reason = form.reason or f"{identity.name} kept the active surface"
+        decisions.reject(session, heliostat, surface, identity.name, Justification(reason))
+    return go_to(f"/heliostats/{name}#history-title")
+
+
+class ExclusionForm(Model):
+    """Photographs to exclude, or to use again, with the reason."""
+
+    photographs: Annotated[list[MeasurementName], Field(min_length=1, max_length=100)]
+    reason: Reason
+    excluded: bool = True
+    predict_again: bool = False
+
+
+@router.post("/heliostats/{name}/exclusions", dependencies=[OPERATE, COMPUTE_SLOT])
+def post_exclusion_form(
+    name: NamePath,
+    form: Annotated[ExclusionForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Exclude photographs or use them again, and go to the job that predicts the surface again."""
+    changes = PhotographChanges(form.reason, excluded=form.excluded)
+    for photograph in form.photographs:
+        correct_photograph(runtime, name, photograph, changes, identity.name)
+    if form.predict_again:
+        return go_to(f"/jobs/{predict_again(runtime, name, identity.name)}")
+    return go_to(f"/heliostats/{name}#excluded-title")
 
 
 @router.post("/heliostats/{name}/surfaces/{version}/acknowledge", dependencies=[OPERATE])

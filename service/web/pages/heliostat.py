@@ -55,6 +55,14 @@ from service.web.pages.heliostat_charts import (
     pointing_values,
     version_marks,
 )
+from service.web.pages.heliostat_decision import (
+    Choice,
+    Exclusion,
+    OutlierEvidence,
+    find_choice,
+    newest_exclusions,
+    outlier_evidence,
+)
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
@@ -255,6 +263,14 @@ def _surface_context(
     }
 
 
+def _choice_maps(
+    read: "_HeliostatData", choice: Choice, ends: Mapping[str, float]
+) -> list[HeatMap]:
+    """The active surface, the candidate, and their difference."""
+    n_facets = len(unpack(choice.candidate.arrays)["z"])
+    return choice.maps(facet_places(read.row, read.origin, n_facets), ends)
+
+
 def _mount_context(mount: MountRow) -> dict[str, object]:
     """What the page shows of a mount: changes of its drives, and contradicting measurements."""
     return {
@@ -293,6 +309,9 @@ class _HeliostatData:
     compared: ComparisonResult
     zone: str
     causes: list[causes.LikelyCause]
+    evidence: OutlierEvidence | None
+    exclusions: list[Exclusion]
+    choice: Choice | None
 
 
 def _read(
@@ -302,8 +321,11 @@ def _read(
     field: FieldCacheDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
+    candidate: Annotated[Version | None, Query()] = None,
 ) -> _HeliostatData:
     """Read a heliostat with its active surface, or an earlier ``version``.
+
+    ``candidate`` is a version to decide on.
 
     It waits for comparisons that are computed in the background.
     """
@@ -318,17 +340,20 @@ def _read(
             session, PhotographFilter(row, verdict=photographs), MAX_PHOTOGRAPHS + 1
         )
         mount = mounts.find_mount_at(session, row)
+        exclusions = newest_exclusions(session, row)
+        choice = find_choice(session, surfaces, today, candidate)
         shown, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
         zone = plant_time_zone(session, runtime.settings.time_zone)
     # The rest of the page does not depend on the comparisons.
     compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
     line = field.with_pointing(line)
     best = None if line.pointing is None else best_slot(runtime, name)
-    likely, settings = list[causes.LikelyCause](), runtime.settings
+    likely, evidence = list[causes.LikelyCause](), None
+    settings = runtime.settings
     with runtime.database.reading() as session:
         facts = causes.read_facts(session, line, row, surface, compared.comparisons, settings)
         if causes.is_poor(session, facts, row, compared.comparisons, settings):
-            likely = causes.rank_causes(facts)
+            likely, evidence = causes.rank_causes(facts), outlier_evidence(facts)
     return _HeliostatData(
         row,
         origin,
@@ -345,6 +370,9 @@ def _read(
         compared,
         zone,
         likely,
+        evidence,
+        exclusions,
+        choice,
     )
 
 
@@ -397,6 +425,10 @@ def get_heliostat_page(
         line=read.line,
         best=read.best,
         causes=read.causes,
+        evidence=read.evidence,
+        exclusions=read.exclusions,
+        choice=read.choice,
+        choice_maps=None if read.choice is None else _choice_maps(read, read.choice, ends),
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(
             _surface_context(read.row, read.surface, read.origin, ends)

@@ -18,6 +18,7 @@ from model.plant import Heliostat
 from service import store
 from service.base.settings import Settings
 from service.web.app import create_app
+from tests.page import Page
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -309,3 +310,46 @@ def test_page_decides_and_takes_back(client: TestClient):
     assert 'action="/heliostats/AA39/surfaces/2/take"' in page
     client.post("/heliostats/AA39/surfaces/2/take", data={}, follow_redirects=False)
     assert current(client) == 2
+
+
+def test_photographs_are_excluded_with_a_reason_and_used_again(
+    client: TestClient, mirrors: Mirrors
+):
+    mirrors.warnings = ("photograph 2 is not explained",)
+    predict(client, "network")
+    page = Page(page_of(client, "/heliostats/AA39"))
+    sent = {"photographs": ["1", "2"], "reason": "a cloud"}
+    path = "/heliostats/AA39/exclusions"
+    assert page.one("h2", id="causes-title").words == "Why is it bad"
+    assert client.post(path, data={"photographs": ["1"]}).status_code == 422
+    answer = client.post(path, data=sent, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"][-15:]) == (303, "#excluded-title")
+    excluded = Page(page_of(client, "/heliostats/AA39"))
+    assert excluded.words.count(": a cloud.") == 2
+    again = {"photographs": ["1"], "reason": "took back: a cloud", "excluded": "false"}
+    assert client.post(path, data=again, follow_redirects=False).status_code == 303
+    kept = client.get("/v1/heliostats/AA39/measurements/1").json()
+    assert (kept["accepted"], kept["reason"]) == (True, None)
+    job = client.post(path, data=sent | {"photographs": ["1"], "predict_again": "true"})
+    assert job.url.path.startswith("/jobs/")
+
+
+def test_candidate_is_kept_or_promoted_with_a_reason(client: TestClient):
+    predict(client, "refined")
+    predict(client, "network")
+    page = Page(page_of(client, "/heliostats/AA39"))
+    assert page.one("h2", id="decide-title").words == "Candidate 2 or version 1"
+    assert "on the same 3 photographs for both: 90.0" in page.words
+    path, reason = "/heliostats/AA39/surfaces/2", {"reason": "no better"}
+    assert client.post(f"{path}/keep", data=reason, follow_redirects=False).status_code == 303
+    kept = Page(page_of(client, "/heliostats/AA39"))
+    assert not kept.all("h2", id="decide-title")
+    assert "version 2 is a candidate. No better" in kept.words
+    assert "/heliostats/AA39?candidate=2#decide-title" in kept.links
+    reason = {"reason": "cleaner photographs"}
+    again = Page(page_of(client, "/heliostats/AA39?candidate=2"))
+    assert f"{path}/take" in again.links
+    assert client.post(f"{path}/take", data=reason, follow_redirects=False).status_code == 303
+    assert current(client) == 2
+    assert client.post(f"{path}/keep", data=reason).status_code == 409
+    assert "Undo: back to version 1" in page_of(client, "/heliostats/AA39")
