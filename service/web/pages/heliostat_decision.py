@@ -76,10 +76,7 @@ class Choice:
 
 
 def find_choice(
-    session: Session,
-    surfaces: Sequence[SurfaceRow],
-    active: SurfaceRow | None,
-    version: int | None,
+    session: Session, surfaces: Sequence[SurfaceRow], active: SurfaceRow | None, version: int | None
 ) -> Choice | None:
     """The candidate of this ``version``, else the newest one on which nobody has decided.
 
