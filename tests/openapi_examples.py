@@ -318,6 +318,7 @@ def administrate(record: Recorder, key: str) -> None:
     record.call("post_acknowledgements", "POST /v1/attention/acknowledgements", json=ids)
     path = "/v1/attention/acknowledgements"
     batches = record.call("list_acknowledgements", f"GET {path}")["items"]
+    record.call("list_attention_causes", "GET /v1/attention/causes")
     record.call("list_attention_history", "GET /v1/attention/history")
     record.call("undo_acknowledgements", f"POST {path}/{batches[0]['id']}/undo")
     record.call("delete_target", "DELETE /v1/targets/upper-target", 204)

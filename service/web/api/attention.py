@@ -18,6 +18,7 @@ from service.twin.alerts.acknowledging import (
     undo_acknowledgement,
 )
 from service.twin.alerts.alerts import Alert, list_alerts
+from service.twin.alerts.common_causes import find_common_causes
 from service.twin.alerts.counts import AlertCount
 from service.twin.alerts.reasons import REASONS, Reason, Severity
 from service.web.auth.dependencies import (
@@ -126,6 +127,19 @@ After = Annotated[Version | None, Query(description="The last id of the page bef
 _ID = attrgetter("id")
 
 
+class CommonCauseOut(BaseModel):
+    """Alerts that probably have one cause."""
+
+    alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
+    first: From
+    last: datetime = Field(description="When the newest of them began.")
+    evidence: list[str] = Field(
+        description="What the store knows of that time; empty if it knows nothing."
+    )
+    heliostats: list[str] = Field(description="Names of the heliostats.")
+    ids: list[ItemId] = Field(description="Ids of the alerts, to acknowledge them together.")
+
+
 async def _count(request: Request) -> AlertCount:
     count: AlertCount = request.app.state.attention
     return count
@@ -205,6 +219,27 @@ def undo_acknowledgements(
     with runtime.database.reading() as session:
         (row,) = acknowledgements.list_batches(session, 1, number=number)
     return _acknowledgement(row)
+
+
+@router.get("/causes", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
+def list_attention_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonCauseOut]:
+    """List probable common causes of alerts that nobody acknowledged, the largest first."""
+    with runtime.database.reading() as session:
+        items, _ = list_alerts(session, cache, runtime.settings)
+        causes = find_common_causes(session, items, runtime.settings)
+    return Page(
+        items=[
+            from_row(
+                CommonCauseOut,
+                cause,
+                alerts=cause.reasons,
+                evidence=list(cause.evidence),
+                ids=[alert.id for alert in cause.alerts],
+            )
+            for cause in causes
+        ],
+        next=None,
+    )
 
 
 @router.get("/history", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])

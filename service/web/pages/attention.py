@@ -19,6 +19,7 @@ from service.twin.alerts.acknowledging import (
     undo_acknowledgement,
 )
 from service.twin.alerts.alerts import Alert, list_alerts
+from service.twin.alerts.common_causes import find_common_causes
 from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason
 from service.web.api.attention import AttentionCountDep, ItemId
 from service.web.auth.dependencies import (
@@ -131,7 +132,8 @@ def get_attention_page(
     with runtime.database.reading() as session:
         items, pending = list_alerts(session, cache, runtime.settings)
         done = query.done and acknowledgements.list_batches(session, 1, number=query.done)
-    chosen = query.choose(items)
+        chosen = query.choose(items)
+        causes = find_common_causes(session, chosen, runtime.settings)
     groups = group_alerts(chosen)
     return render(
         request,
@@ -142,6 +144,8 @@ def get_attention_page(
         comments=COMMENTS,
         groups=groups if query.sort == "severity" else [],
         chosen=chosen,
+        causes=causes,
+        single=len(chosen) - sum(len(cause.alerts) for cause in causes),
         listed=_LISTED if query.reason is None else 5 * _LISTED,
         others=sum((item.acknowledged_by is not None) != query.acknowledged for item in items),
         done=done[0] if done else None,
@@ -168,14 +172,16 @@ def post_acknowledgement_form(
     """Acknowledge the ticked alerts and groups with one reason, and return to the list."""
     ids = dict.fromkeys(form.ids)
     with runtime.database.reading() as session:
-        items = list_alerts(session, cache, runtime.settings).alerts
-    groups = {group.token: group.alerts for group in group_alerts(query.choose(items))}
+        chosen = query.choose(list_alerts(session, cache, runtime.settings).alerts)
+        causes = find_common_causes(session, chosen, runtime.settings)
+    groups = {group.token: group.alerts for group in group_alerts(chosen)}
+    groups |= {cause.token: cause.alerts for cause in causes}
     for token in form.groups:
         if token not in groups:
-            name = token.partition(":")[0].replace("_", " ")
+            name = "cause" if token.startswith("cause:") else "reason"
             raise ConflictError(
-                f"groups: the alarms of {name} changed since the page was opened; look at them"
-                " again"
+                f"groups: the alarms of this {name} changed since the page was opened; look at"
+                " them again"
             )
         ids |= dict.fromkeys(alert.id for alert in groups[token])
     done = acknowledge(runtime, cache, list(ids), identity.name, form.comment)

@@ -1,0 +1,235 @@
+"""Probable common causes of alerts that began together.
+
+Alerts of one reason that began within a day, and more often than usual, are a burst. What the store
+knows of that time is evidence of its cause. Bursts with the same evidence have one cause.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from itertools import groupby
+from statistics import median
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.base.settings import Settings
+from service.store.job_tables import JobRow
+from service.store.tables import (
+    SUN_CONTRADICTS_TIME,
+    HeliostatRow,
+    MeasurementRow,
+    ModelRow,
+    TargetRow,
+)
+from service.twin.alerts.acknowledging import group_token
+from service.twin.alerts.alerts import Alert
+from service.twin.alerts.reasons import REASONS, Reason
+
+MIN_ALERTS = 5
+"""Smallest number of alerts in a burst."""
+
+_WINDOW = timedelta(days=1)
+_LEAST_RATIO = 5.0  # of a burst's alerts to those that begin on another day
+_LEAST_DAYS = 30.0  # over which the other alerts are counted at least
+_WINDY_M_S = 10.0
+_NEARLY_ALL = 0.8
+_MOST_NAMES = 1000  # heliostats whose photographs are read
+
+_CAUSED: dict[Reason, tuple[Reason, ...]] = {
+    "camera": ("accuracy", "fell", "untrusted", "unlike_heliostat"),
+    "clock": ("moved", "pointing", "drift", "sun_contradicts_time"),
+}
+"""Reasons of the plant, with the reasons of heliostats that may follow from them."""
+
+_BY_MODEL: tuple[Reason, ...] = ("accuracy", "fell", "pointing", "untrusted")
+_BY_JOB: dict[Reason, str] = {
+    "untrusted": "predictions",
+    "unlike_heliostat": "imports",
+    "sun_contradicts_time": "imports",
+    "times_unknown": "imports",
+}
+_ON_ARRIVAL: tuple[Reason, ...] = ("unlike_heliostat", "sun_contradicts_time", "times_unknown")
+"""Reasons that begin when a photograph arrives."""
+_WHEN_TAKEN: tuple[Reason, ...] = ("accuracy", "fell", "moved", "pointing")
+"""Reasons that begin when a photograph is taken."""
+
+
+@dataclass(frozen=True)
+class CommonCause:
+    """Alerts that probably have one cause. ``evidence`` is empty if the store has none."""
+
+    alerts: tuple[Alert, ...]
+    evidence: tuple[str, ...]
+
+    @property
+    def first(self) -> datetime:
+        """Since when the oldest alert lasts."""
+        return min(alert.since for alert in self.alerts)
+
+    @property
+    def last(self) -> datetime:
+        """Since when the newest alert lasts."""
+        return max(alert.since for alert in self.alerts)
+
+    @property
+    def heliostats(self) -> list[str]:
+        """Names of the heliostats."""
+        return sorted({alert.heliostat for alert in self.alerts if alert.heliostat})
+
+    @property
+    def reasons(self) -> dict[Reason, int]:
+        """Number of alerts of each reason."""
+        return dict(Counter(alert.reason for alert in self.alerts))
+
+    @property
+    def token(self) -> str:
+        """Identifier of the cause with exactly these alerts."""
+        return group_token("cause", self.alerts)
+
+
+def find_common_causes(
+    session: Session, alerts: Sequence[Alert], settings: Settings
+) -> list[CommonCause]:
+    """Find bursts among ``alerts`` that nobody acknowledged, the largest first."""
+    opened = [alert for alert in alerts if alert.acknowledged_by is None]
+    found = [
+        CommonCause(burst, tuple(_evidence(session, burst, opened, settings)))
+        for reason in REASONS
+        for burst in find_bursts([a for a in opened if a.reason == reason and a.heliostat])
+    ]
+    merged = []
+    for evidence, causes in groupby(
+        sorted(found, key=lambda one: one.evidence), key=lambda one: one.evidence
+    ):
+        same = list(causes)
+        merged += (
+            [CommonCause(tuple(alert for one in same for alert in one.alerts), evidence)]
+            if evidence
+            else same
+        )
+    return sorted(merged, key=lambda one: -len(one.alerts))
+
+
+def find_bursts(alerts: Sequence[Alert]) -> list[tuple[Alert, ...]]:
+    """Find the alerts of one reason that began within a day, repeatedly the most at once."""
+    bursts = []
+    rest = sorted(alerts, key=lambda alert: alert.since)
+    while len(rest) >= MIN_ALERTS:
+        ends = [
+            sum(one.since <= alert.since + _WINDOW for one in rest[place:]) + place
+            for place, alert in enumerate(rest)
+        ]
+        start = max(range(len(rest)), key=lambda place: ends[place] - place)
+        burst, others = rest[start : ends[start]], rest[:start] + rest[ends[start] :]
+        span = rest[-1].since - rest[0].since
+        usual = len(others) / max(span / _WINDOW, _LEAST_DAYS)
+        if len(burst) < max(MIN_ALERTS, _LEAST_RATIO * usual):
+            break
+        bursts.append(tuple(burst))
+        rest = others
+    return bursts
+
+
+# --- evidence
+# --------------------------------------------------------------------------------------------------
+
+
+def _evidence(
+    session: Session, burst: tuple[Alert, ...], alerts: Sequence[Alert], settings: Settings
+) -> Iterator[str]:
+    """What the store knows of the time when a burst began, the most specific first."""
+    reason, cause = burst[0].reason, CommonCause(burst, ())
+    before = cause.first - _WINDOW
+    for alert in alerts:
+        if reason in _CAUSED.get(alert.reason, ()) and before <= alert.since <= cause.last:
+            yield f"{REASONS[alert.reason].label.lower()}: {alert.message}"
+    if reason in _BY_MODEL:
+        yield from _models(session, before, cause.last)
+    if reason in _BY_JOB:
+        yield from _jobs(session, _BY_JOB[reason], cause)
+    if reason in ("accuracy", "fell"):
+        yield from _photographed(session, cause)
+    if reason in (*_ON_ARRIVAL, *_WHEN_TAKEN):
+        yield from _photographs(session, reason, cause)
+    if reason == "no_photograph":
+        yield from _unphotographed(session, cause, settings)
+
+
+def _models(session: Session, first: datetime, last: datetime) -> Iterator[str]:
+    for row in session.scalars(select(ModelRow).order_by(ModelRow.number)):
+        for at, verb in ((row.adopted_at, "became active"), (row.withdrawn_at, "was withdrawn")):
+            if at is not None and first <= at <= last:
+                yield f"version {row.number} of the model {verb} on {at:%Y-%m-%d %H:%M} UTC"
+
+
+def _jobs(session: Session, kind: str, cause: CommonCause) -> Iterator[str]:
+    ran = select(JobRow.id).where(
+        JobRow.kind == kind, JobRow.started_at <= cause.last, JobRow.finished_at >= cause.first
+    )
+    for number in session.scalars(ran.order_by(JobRow.id)):
+        yield f"job {number} ({kind}) ran at that time"
+
+
+def _photographed(session: Session, cause: CommonCause) -> Iterator[str]:
+    """Whether nearly all heliostats that were photographed at that time are affected."""
+    row = MeasurementRow
+    query = select(func.count(row.heliostat_id.distinct())).where(
+        row.accepted, row.taken_at.between(cause.first, cause.last)
+    )
+    count, affected = session.scalar(query) or 0, len(cause.heliostats)
+    if affected >= _NEARLY_ALL * count:
+        yield (
+            f"{affected} of {max(count, affected)} heliostats that were photographed at that time"
+            " are affected, as by haze or a camera"
+        )
+
+
+def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterator[str]:
+    """What the photographs of the burst have in common."""
+    row = MeasurementRow
+    moment = row.created_at if reason in _ON_ARRIVAL else row.taken_at
+    query = (
+        select(TargetRow.name, row.sent_by, row.wind_speed_m_s, row.warnings)
+        .join(TargetRow, TargetRow.id == row.target_id)
+        .join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
+        .where(moment.between(cause.first, cause.last))
+        .where(HeliostatRow.name.in_(cause.heliostats[:_MOST_NAMES]))
+    )
+    rows = session.execute(query).all()
+    if reason == SUN_CONTRADICTS_TIME:
+        clocks = {
+            warning["detail"].partition("; ")[2]
+            for *_, warnings in rows
+            for warning in warnings or ()
+            if warning["type"] == SUN_CONTRADICTS_TIME
+        }
+        if len(clocks) == 1:
+            yield clocks.pop()
+    targets = {target for target, *_ in rows}
+    if len(targets) == 1 and session.scalar(select(func.count(TargetRow.id))) != 1:
+        yield f"all photographs were taken on {targets.pop()}"
+    senders = {sender for _, sender, *_ in rows}
+    if reason in _ON_ARRIVAL and len(senders) == 1 and None not in senders:
+        yield f"all photographs were sent by {senders.pop()}"
+    winds = [wind for _, _, wind, _ in rows if wind is not None]
+    if winds and median(winds) >= _WINDY_M_S:
+        yield f"the wind was {median(winds):.0f} m/s"
+
+
+def _unphotographed(session: Session, cause: CommonCause, settings: Settings) -> Iterator[str]:
+    """Whether nobody photographed the field, or the heliostats were added together."""
+    allowed = timedelta(days=settings.attention_photograph_days)
+    last = cause.last - allowed
+    newest = session.scalar(
+        select(func.max(MeasurementRow.taken_at)).where(MeasurementRow.accepted)
+    )
+    names = HeliostatRow.name.in_(cause.heliostats[:_MOST_NAMES])
+    newest_added = session.scalar(select(func.max(HeliostatRow.created_at)).where(names))
+    if newest is not None and newest <= last + _WINDOW / 24:
+        yield f"no heliostat was photographed after {newest:%Y-%m-%d %H:%M} UTC"
+    elif newest is None:
+        yield "no photograph with a known time was ever accepted"
+    if newest_added is not None and abs(newest_added - last) < _WINDOW:
+        yield f"the heliostats were added on {newest_added:%Y-%m-%d}, and not photographed since"
