@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from sqlalchemy import ColumnElement, Select, and_, exists, func, not_, select, tuple_
+from sqlalchemy import ColumnElement, Select, and_, exists, false, func, not_, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from service.base.errors import NotFoundError
@@ -162,6 +162,36 @@ def list_groups(
     if filters.undated and len(found) < limit:
         mark_id = None if last is None or last.taken_at is not None else last.id
         found += session.scalars(undated_groups(filters, limit - len(found), mark_id))
+    return _grouped(session, found)
+
+
+def get_group(session: Session, mark: int) -> PhotographGroup:
+    """The photograph of a mark; NotFoundError if there is none."""
+    row = session.get(_Row, mark)
+    if row is None:
+        raise NotFoundError(f"at: there is no photograph of the mark {mark}; begin again")
+    return _grouped(session, [row])[0]
+
+
+def count_groups(
+    session: Session, filters: PhotographFilter, before: MeasurementRow | None = None
+) -> int:
+    """The number of photographs, or of those that the list has before ``before``."""
+    taken = Period(filters.since, filters.until).conditions(_Row.taken_at)
+    dated = _groups(filters).where(_Row.taken_at.is_not(None), *taken)
+    undated = _groups(filters).where(_Row.taken_at.is_(None))
+    if before is not None and before.taken_at is not None:
+        dated = dated.where(tuple_(_Row.taken_at, _Row.id) > (before.taken_at, before.id))
+        undated = undated.where(false())
+    elif before is not None:
+        undated = undated.where(_Row.id > before.id)
+    parts = [*([dated] if filters.dated else []), *([undated] if filters.undated else [])]
+    counts = (select(func.count()).select_from(part.subquery()) for part in parts)
+    return sum(session.scalars(count).one() for count in counts)
+
+
+def _grouped(session: Session, found: Sequence[MeasurementRow]) -> list[PhotographGroup]:
+    """The photographs of rows, each with all its images."""
     known = select(HeliostatRow.id, HeliostatRow.name).where(
         HeliostatRow.id.in_({row.heliostat_id for row in found})
     )

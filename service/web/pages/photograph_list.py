@@ -55,6 +55,15 @@ class PhotographsQuery(Model):
         )
         return f"{path}?{query_string}" if query_string else path
 
+    @property
+    def filters(self) -> dict[str, str]:
+        """The fields of the filters that are set, for hidden fields of forms."""
+        asked = self.model_dump(mode="json", exclude_none=True, exclude={"before"})
+        return {
+            name: str(value).lower() if value is True else str(value)
+            for name, value in asked.items()
+        }
+
     def filter(self, session: Session) -> PhotographFilter:
         """The same as a filter; NotFoundError if heliostat or target are not stored."""
         return PhotographFilter(

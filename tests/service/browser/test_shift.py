@@ -53,6 +53,7 @@ PATHS = (
     "/heliostats/AB01",
     "/photographs",
     "/photographs/times",
+    "/photographs/review",
     "/forecast",
     "/forecasts/1",
     "/studies",

@@ -1,0 +1,148 @@
+"""Queue of photographs to review: accept, exclude or skip each, and undo."""
+
+from typing import Annotated, Literal
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from model.errors import InvalidInputError, ModelError
+from service.base.errors import NotFoundError, ServiceError
+from service.base.fields import Reason, Version
+from service.store import audit
+from service.store.photographs.correction_log import list_corrections
+from service.store.photographs.groups import count_groups, get_group, list_groups
+from service.store.photographs.measurements import EXCLUDED
+from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
+from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.display import compare_one
+from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.pages.heliostat import comparison_figures
+from service.web.pages.photograph_list import PhotographsQuery
+from service.web.responses.pages import go_to, render
+
+router = APIRouter(include_in_schema=False, prefix="/photographs/review")
+
+REASONS = (
+    "clouds",
+    "another heliostat's light on it",
+    "not on the target",
+    "overexposed",
+    "another heliostat",
+    "wrong time or sun",
+    "other",
+)
+"""Reasons to exclude that the page offers."""
+
+
+class ReviewQuery(PhotographsQuery):
+    """Filters as of the list, the shown photograph ``at``, and the correction to undo."""
+
+    at: Version | None = None
+    undo: Version | None = None
+
+    def review(self, path: str = "/photographs/review", **more: int | None) -> str:
+        """The URL of the queue with these filters."""
+        asked = self.filters | {name: str(one) for name, one in more.items() if one is not None}
+        return f"{path}?{urlencode(asked)}" if asked else path
+
+    @property
+    def filters(self) -> dict[str, str]:
+        """The filters without what the page shows."""
+        shown = PhotographsQuery.model_fields
+        return {name: one for name, one in super().filters.items() if name in shown}
+
+
+class ReviewForm(ReviewQuery):
+    """The buttons: ``next`` is the photograph after this one."""
+
+    at: Version
+    next: Version | None = None
+    action: Literal["accept", "exclude"]
+    reason: Reason = "reviewed"
+
+
+class UndoForm(ReviewQuery):
+    """The button that undoes the last exclusion."""
+
+    undo: Version
+
+
+@router.get("", dependencies=[READ, COMPUTE_SLOT])
+def get_review_page(
+    request: Request, query: Annotated[ReviewQuery, Query()], runtime: RuntimeDep
+) -> HTMLResponse:
+    """A photograph with its verdict and forecast, its place in the queue, and the buttons."""
+    with runtime.database.reading() as session:
+        chosen = query.filter(session)
+        listed = list_groups(session, chosen, 1, query.before) if query.at is None else []
+        group = get_group(session, query.at) if query.at else next(iter(listed), None)
+        total, place, following = count_groups(session, chosen), 0, None
+        if group is not None:
+            row = next(image for image in group.images if image.id == group.mark)
+            place = min(count_groups(session, chosen, row) + 1, max(total, 1))
+            following = next(iter(list_groups(session, chosen, 1, group.mark)), None)
+    compared, trouble = [], None
+    if group is not None and group.best.image_sha256 and group.verdict != "refused":
+        try:
+            compared = [compare_one(runtime, group.heliostat, group.best.identifier)]
+        except (ModelError, ServiceError) as error:
+            trouble = str(error)
+    return render(
+        request,
+        "photograph_review.html",
+        query=query,
+        group=group,
+        images={image.kind: image for image in group.images if image.has_file} if group else {},
+        following=following,
+        place=place,
+        total=total,
+        comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
+        trouble=trouble,
+        reasons=REASONS,
+    )
+
+
+@router.post("", dependencies=[OPERATE, COMPUTE_SLOT])
+def post_review_form(
+    form: Annotated[ReviewForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Accept or exclude a photograph, and go to the next one."""
+    with runtime.database.reading() as session:
+        group = get_group(session, form.at)
+    is_excluded, undo = group.verdict == "excluded", None
+    if form.action == "accept" and group.verdict == "refused":
+        raise InvalidInputError(
+            f"action: {group.name} was refused by its measurement; correct it on its page instead"
+        )
+    if is_excluded != (form.action == "exclude"):
+        changes = PhotographChanges(form.reason, excluded=not is_excluded)
+        name, identifier = group.heliostat, group.best.identifier
+        row = correct_photograph(runtime, name, identifier, changes, identity.name)
+        with runtime.database.reading() as session:
+            undo = list_corrections(session, row)[-1].id
+    else:
+        with runtime.database.writing() as session:
+            subject = f"heliostat {group.heliostat} {group.best.identifier}"
+            audit.record(session, identity.name, "measurement.reviewed", subject)
+    if form.next is None:
+        return go_to(form.review(before=form.at, undo=undo))
+    return go_to(form.review(at=form.next, undo=undo))
+
+
+@router.post("/undo", dependencies=[OPERATE, COMPUTE_SLOT])
+def post_undo_form(
+    form: Annotated[UndoForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Undo an exclusion or acceptance, and show the photograph again."""
+    with runtime.database.reading() as session:
+        correction = session.get(CorrectionRow, form.undo)
+        if correction is None or "excluded" not in correction.before:
+            raise NotFoundError(f"undo: there is no exclusion {form.undo}")
+        row = session.get_one(MeasurementRow, correction.measurement_id)
+        name = session.get_one(HeliostatRow, row.heliostat_id).name
+        before = bool(correction.before["excluded"])
+    if (row.reason == EXCLUDED) != before:
+        changes = PhotographChanges("review undone", excluded=before)
+        correct_photograph(runtime, name, row.identifier, changes, identity.name)
+    return go_to(form.review(at=row.id))
