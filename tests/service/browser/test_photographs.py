@@ -6,19 +6,11 @@ from typing import Any
 
 import pytest
 
-from service.base.settings import Settings
 from service.web.app import create_app
 from tests.service import real
-from tests.service.browser.browsing import (
-    DESK,
-    PHONE,
-    GatedOperations,
-    Served,
-    expect,
-    violations,
-)
+from tests.service.browser.browsing import DESK, PHONE, GatedOperations, Served, expect, violations
 from tests.service.browser.test_shift import AXE, LOW, TOO_WIDE
-from tests.service.conftest import QUIET, free_port, serving
+from tests.service.conftest import free_port, serving
 
 WINDOWS = [
     pytest.param(DESK, "light", id="desk-light"),
@@ -36,9 +28,7 @@ def served(real_copy: Path) -> Iterator[Served]:
 
 
 @pytest.mark.parametrize(("size", "scheme"), WINDOWS)
-def test_photographs_are_reviewed_by_keys_and_undone(
-    page: Any, size: dict[str, int], scheme: str
-):
+def test_photographs_are_reviewed_by_keys_and_undone(page: Any, size: dict[str, int], scheme: str):
     page.set_viewport_size(size)
     page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
     page.goto("/photographs?heliostat=AA39")

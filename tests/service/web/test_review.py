@@ -17,9 +17,7 @@ QUEUE = "/photographs/review"
 def queue(client: TestClient, post: Post) -> TestClient:
     """Three photographs of three days, the newest one refused."""
     for day in (1, 2, 3):
-        answer = post(
-            png(day, refused=day == 3), id=f"{day}", taken_at=f"2024-06-0{day}T12:00:00Z"
-        )
+        answer = post(png(day, refused=day == 3), id=f"{day}", taken_at=f"2024-06-0{day}T12:00:00Z")
         assert answer.status_code == 201
     return client
 
@@ -84,9 +82,11 @@ def test_the_queue_has_the_filters_of_the_list(queue: TestClient):
 
 
 def test_a_refused_photograph_is_not_accepted_by_a_button(queue: TestClient):
-    mark = text_of(queue, QUEUE).one("form", class_="inline", action=QUEUE).one(
-        "input", name="at"
-    )["value"]
+    mark = (
+        text_of(queue, QUEUE)
+        .one("form", class_="inline", action=QUEUE)
+        .one("input", name="at")["value"]
+    )
     answer = queue.post(QUEUE, data={"at": mark, "action": "accept"}, headers=HTML)
     assert answer.status_code == 422
     assert "refused by its measurement" in answer.text
