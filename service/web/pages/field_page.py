@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, ClassVar
 from urllib.parse import urlencode
 
@@ -11,16 +12,14 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from pydantic import Field
-from sqlalchemy import func, select
-from sqlalchemy.orm import Session
 
 from service import store
 from service.base.fields import Search
 from service.base.settings import Settings
 from service.drawing.charts import CONDITION, Scale
 from service.drawing.pictures import places_picture
-from service.store.job_tables import JobRow
-from service.store.tables import PlantRow, TargetRow
+from service.drawing.templates import in_zone
+from service.store.tables import PlantRow
 from service.twin.alerts.field_filter import (
     CONDITIONS,
     METRICS,
@@ -30,6 +29,10 @@ from service.twin.alerts.field_filter import (
     filter_heliostats,
 )
 from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.alerts.field_state import PERIODS, Period, field_accuracy, recent_work
+from service.twin.alerts.reasons import SEVERITIES
+from service.twin.forecasts.aim_sources import plant_time_zone
+from service.web.api.attention import AttentionCountDep
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
 from service.web.responses.pages import go_to, render
 
@@ -43,6 +46,7 @@ class FieldView(HeliostatFilter):
     """The view of the page, which is encoded in its URL."""
 
     page: int = Field(default=1, ge=1, le=10**6)
+    period: Period = "30"
 
     def link(self, **changes: Any) -> str:
         """The URL of this view with changed parameters, on the first page."""
@@ -66,11 +70,11 @@ class FieldView(HeliostatFilter):
 class Marks:
     """Heliostats of one colour on the map, as a path of squares.
 
-    ``colour`` is None if the values are not known. ``names`` and ``texts``, the formatted values,
+    ``step`` is the place of the colour from fine, 0, to poor, `STEPS` - 1. It is None if the values are not known. ``names`` and ``texts``, the formatted values,
     are in the order of the path.
     """
 
-    colour: str | None
+    step: int | None
     path: str
     names: str
     texts: str
@@ -141,8 +145,27 @@ def _text(line: HeliostatOverview, metric: Metric) -> str:
     return "not yet evaluated" if is_unjudged else "not known"
 
 
+STEPS = 9
+"""Colours of the map; the style sheet has them for light and for dark cards."""
+
+
+@dataclass(frozen=True)
+class LegendStep:
+    """A colour of the map, as its place from fine to poor, and the values from which it holds."""
+
+    step: int
+    low: float
+
+
+def legend(fine: float, poor: float) -> list[LegendStep]:
+    """The colours of the map by rising values."""
+    low, width = min(fine, poor), abs(fine - poor) / STEPS
+    order = range(STEPS) if fine < poor else range(STEPS)[::-1]
+    return [LegendStep(step, low + place * width) for place, step in enumerate(order)]
+
+
 def scale_for(metric: Metric, settings: Settings) -> Scale:
-    """Colours of a metric, from blue (fine) to red (poor), the same for every field."""
+    """Colours of a metric's picture, from blue (fine) to red (poor), the same for every field."""
     fine, poor = settings.map_scales[metric.name]
     label = f"{metric.label} [{metric.unit}]"
     colours = CONDITION if poor < fine else f"{CONDITION}_r"
@@ -169,25 +192,28 @@ def _marks(
     lines: Sequence[HeliostatOverview],
     places: dict[str, tuple[float, float]],
     metric: Metric,
-    scale: Scale,
+    ends: tuple[float, float],
     side: float,
 ) -> list[Marks]:
     values = [metric.shown(line) for line in lines]
     known = [(line, value) for line, value in zip(lines, values, strict=True) if value is not None]
-    groups: dict[str, list[tuple[HeliostatOverview, float]]] = {}
-    for entry, colour in zip(known, scale.names([value for _, value in known]), strict=True):
-        groups.setdefault(colour, []).append(entry)
+    fine, poor = ends
+    shares = (np.array([value for _, value in known]) - fine) / (poor - fine)
+    steps = np.clip(shares * STEPS, 0, STEPS - 1).astype(int).tolist()
+    groups: dict[int, list[tuple[HeliostatOverview, float]]] = {}
+    for entry, step in zip(known, steps, strict=True):
+        groups.setdefault(step, []).append(entry)
     template = (  # `%` formatting, because it is faster for 20,000 heliostats
         f"%.{metric.digits}f\N{NO-BREAK SPACE}{metric.unit.replace('%', '%%')}"
     )
     marks = [
         Marks(
-            colour,
+            step,
             _squares([places[line.name] for line, _ in group], side),
             "|".join([line.name for line, _ in group]),
             "|".join([template % value for _, value in group]),
         )
-        for colour, group in groups.items()
+        for step, group in sorted(groups.items())
     ]
     others = [line for line, value in zip(lines, values, strict=True) if value is None]
     if others:
@@ -204,11 +230,11 @@ def draw(
     lines: Sequence[HeliostatOverview],
     chosen: Sequence[HeliostatOverview],
     metric: Metric,
-    scale: Scale,
+    ends: tuple[float, float],
 ) -> Drawing:
     """Draw the map of ``lines``, with the ``chosen`` ones emphasized.
 
-    The tower, at the origin, is always on the map.
+    ``ends`` are the values that are fine and poor, where the colours end. The tower, at the origin, is always on the map.
     """
     east = np.array([line.east_m for line in lines] + [0.0])
     north = np.array([line.north_m for line in lines] + [0.0])
@@ -230,7 +256,7 @@ def draw(
         width,
         height,
         side,
-        _marks(chosen, places, metric, scale, side),
+        _marks(chosen, places, metric, ends, side),
         _squares(flagged, side + min(side, 6.0)),
         _squares(left_out, side),
         (float(x[-1]), float(y[-1])),
@@ -239,29 +265,14 @@ def draw(
     )
 
 
-def _totals(session: Session) -> dict[str, object]:
-    plant = session.get(PlantRow, 1)
-    running = (
-        select(func.count()).select_from(JobRow).where(JobRow.state.in_(("queued", "running")))
-    )
-    return {
-        "plant": None if plant is None else plant.name,
-        "targets": session.scalars(select(func.count()).select_from(TargetRow)).one(),
-        "live_jobs": session.scalars(running).one(),
-    }
-
-
 def _counts(lines: Sequence[HeliostatOverview]) -> dict[str, int]:
     """Totals of all heliostats, for the tiles."""
     surfaces = [line.surface for line in lines if line.surface is not None]
     flagged = [surface for surface in surfaces if surface.warnings]
     return {
         "surfaces": len(surfaces),
-        "photographs": sum(line.photographs for line in lines),
-        "refused": sum(line.refused for line in lines),
         "flagged": len(flagged),
         "unacknowledged": sum(not surface.acknowledged_by for surface in flagged),
-        "judged": sum(line.rank is not None and line.rank.photographs > 0 for line in lines),
     }
 
 
@@ -280,12 +291,19 @@ def get_found_heliostat(runtime: RuntimeDep, find: Annotated[Search, Query()] = 
 
 @router.get("/", dependencies=[RENDER_SLOT])
 def get_field(
-    request: Request, runtime: RuntimeDep, cache: FieldCacheDep, view: Annotated[FieldView, Query()]
+    request: Request,
+    runtime: RuntimeDep,
+    cache: FieldCacheDep,
+    count: AttentionCountDep,
+    view: Annotated[FieldView, Query()],
 ) -> HTMLResponse:
-    """The field map, with the filtered heliostats emphasized, and one page of their table."""
+    """The state of the field, its map with the filtered heliostats emphasized, and their table."""
     with runtime.database.reading() as session:
-        now, totals = cache.read(session), _totals(session)
+        now, plant = cache.read(session), session.get(PlantRow, 1)
+        work = cache.recent(session, ("work", view.period), partial(recent_work, session, view.period))
+        zone = plant_time_zone(session, runtime.settings.time_zone)
     lines, chosen = now.lines, METRICS[view.metric]
+    limit, ends = runtime.settings.attention_accuracy, runtime.settings.map_scales[view.metric]
     found = filter_heliostats(lines, view)
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED
@@ -293,7 +311,14 @@ def get_field(
     return render(
         request,
         "field.html",
-        **totals,
+        plant=None if plant is None else plant.name,
+        in_zone=in_zone(zone),
+        alarms=count.by_severity(),
+        severities=SEVERITIES,
+        accuracy=field_accuracy(lines, limit),
+        limit=limit,
+        work=work,
+        periods=PERIODS,
         lines=lines,
         counts=_counts(lines),
         found=len(found),
@@ -306,10 +331,11 @@ def get_field(
         metrics=METRICS,
         metric=chosen,
         scale=scale,
-        fine=runtime.settings.map_scales[view.metric][0],
-        poor=runtime.settings.map_scales[view.metric][1],
+        fine=ends[0],
+        poor=ends[1],
+        steps=legend(*ends),
         field_map=FieldMap(found, chosen, scale),
-        drawing=draw(lines, found, chosen, scale) if lines else None,
+        drawing=draw(lines, found, chosen, ends) if lines else None,
         pending=now.pending,
         is_behind=now.is_behind,
         # The computation for a large field takes time, and its page is long. Reload less often the

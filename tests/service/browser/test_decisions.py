@@ -138,6 +138,8 @@ def test_what_is_not_trusted_nor_judged_says_so(seen: Any):
 @SIZES
 def test_photograph_is_found_looked_at_and_corrected(seen: Any, size: dict[str, int]):
     seen.goto("/")
+    if size is PHONE:
+        seen.click("text=Menu")
     follow(seen, "nav >> text=Photographs")
     expect(seen.locator("tbody th[scope=row]")).to_have_count(6)
     small = "[...document.images].filter((e) => e.className == 'thumbnail')"

@@ -1,5 +1,6 @@
 """The home page, the menu and the search in a real browser, at a desk and on a phone."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -44,3 +45,28 @@ def test_menu_and_search(page: Any, size: dict[str, int], scheme: str):
     with page.expect_navigation():
         page.keyboard.press("Enter")
     expect(page.locator("h1")).to_have_text("Heliostat AA39")
+
+
+@pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")])
+def test_map_is_beside_the_table(page: Any, size: dict[str, int], scheme: str):
+    page.set_viewport_size(size)
+    page.emulate_media(color_scheme=scheme)
+    page.goto("/?period=7&metric=deviation_mm")
+    expect(page.locator('[data-map] [fill^="var("]')).to_be_attached()
+    field, table = (
+        page.locator(f"section[aria-labelledby={name}]").bounding_box()
+        for name in ("map-title", "table-title")
+    )
+    if size is DESK:
+        assert field["x"] + field["width"] <= table["x"]
+        assert abs(field["y"] - table["y"]) < 2
+    else:
+        assert field["y"] + field["height"] <= table["y"]
+    assert page.evaluate(TOO_WIDE) <= 0
+    assert violations(page, **AXE) == []
+    page.select_option("#show", "surface")
+    expect(page).to_have_url(re.compile("show=surface&period=7"))
+    with page.expect_navigation():
+        page.click("text=90 days")
+    expect(page.locator("#state [aria-current]")).to_have_text("90\N{NO-BREAK SPACE}days")
+    expect(page.locator("#show")).to_have_value("surface")

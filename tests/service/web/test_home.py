@@ -1,20 +1,32 @@
 """The home page, and what every page has: the menu, the search, and the banner."""
 
+import re
 from collections.abc import Iterator
+from datetime import timedelta
 
 import pytest
 from fastapi.testclient import TestClient
 
+from model.ephemeris import sun_angles_at
 from service.base.settings import Settings
+from service.drawing.templates import ASSETS
+from service.store.columns import now
+from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.alerts.field_state import FieldAccuracy, field_accuracy
+from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
+from service.web.pages.field_page import STEPS
 from tests.service.conftest import (
+    ORIGIN,
     QUIET,
     FakeOperations,
     client_of,
+    png,
+    poster,
     properties_document,
     tower_document,
 )
-from tests.service.web.pages import HTML, text_of
+from tests.service.web.pages import HTML, settled, text_of
 
 NAMES = ("AA39", "AA3", "AB01")
 
@@ -22,7 +34,7 @@ NAMES = ("AA39", "AA3", "AB01")
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     folder = tmp_path_factory.mktemp("home")
-    settings = Settings(data_dir=folder, attention_photograph_days=1e-6, **QUIET)
+    settings = Settings(data_dir=folder, attention_photograph_days=1e-9, **QUIET)
     with client_of(create_app(settings, FakeOperations())) as client:
         assert client.put("/v1/plant", json=tower_document()).status_code == 200
         for place, name in enumerate(NAMES):
@@ -65,3 +77,79 @@ def test_menu_has_the_count_of_alarms_without_scripts(home: TestClient):
     assert home.get("/attention/count").text
     menu = text_of(home, "/").one("nav", aria_label="Pages")
     assert menu.one("span", class_="count").words == f"{len(NAMES)} not acknowledged"
+
+
+# --- colours of the map
+# --------------------------------------------------------------------------------------------------
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance by WCAG 2.2."""
+    values = [int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)]
+    red, green, blue = (
+        one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in values
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+def test_worse_is_more_conspicuous_on_the_map(scheme: int):
+    style = ASSETS.joinpath("app.css").read_text()
+    card = re.findall(r"--card: (#[0-9a-f]{6})", style)[scheme]
+    contrasts = []
+    for step in range(STEPS):
+        colour = re.findall(rf"--s{step}: (#[0-9a-f]{{6}})", style)[scheme]
+        low, high = sorted((luminance(colour), luminance(card)))
+        contrasts.append((high + 0.05) / (low + 0.05))
+    assert contrasts == sorted(contrasts)
+    assert contrasts[0] >= 3
+    assert contrasts[-1] >= 2 * contrasts[0]
+
+
+# --- state of the field
+# --------------------------------------------------------------------------------------------------
+
+
+def test_accuracy_of_the_field():
+    ranks = {"A": 0.9, "B": 0.7, "C": None, "D": 0.8, "E": 0.95, "F": 0.6, "G": 0.99}
+    lines = [HeliostatOverview(name, 0, 0, rank=Rank(one, 1)) for name, one in ranks.items()]
+    found = field_accuracy([*lines, HeliostatOverview("H", 0, 0)], 0.75)
+    assert (found.evaluated, found.below) == (6, 2)
+    assert found.mean == pytest.approx(0.8233, abs=1e-4)
+    assert found.worst == [("F", 0.6), ("B", 0.7), ("D", 0.8), ("A", 0.9), ("E", 0.95)]
+    assert field_accuracy([], 0.75) == FieldAccuracy(None, 0, 0, [])
+
+
+def tile(client: TestClient, label: str, period: str = "30") -> str:
+    """What a tile of the home page says."""
+    tiles = settled(client, f"/?period={period}").all("div", class_="tile")
+    (found,) = [one for one in tiles if one.words.startswith(label)]
+    parts = [found.one("dd"), *found.all("small")]
+    return ": ".join(one.words for one in parts).replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_tiles_have_the_state_of_the_plant(home: TestClient):
+    assert tile(home, "Alarms") .endswith(": 0 act now, 0 act today, 3 when there is time")
+    assert tile(home, "Mean") .endswith(": no photograph was forecast in 30 days")
+    send, made = poster(home), {}
+    for seed, days in enumerate((50, 45, 10)):
+        at = (now() - timedelta(days=days)).replace(hour=11, minute=0)
+        azimuth, elevation = sun_angles_at(at, ORIGIN)
+        sun = {"azimuth_deg": azimuth, "elevation_deg": elevation}
+        answer = send(png(seed), id=f"10{seed}", taken_at=at.isoformat(), sun=sun)
+        assert answer.status_code == 201, answer.text
+        made[days] = at
+        if not seed:
+            body = {"measurements": ["100"]}
+            assert home.post("/v1/heliostats/AA39/surfaces", json=body).status_code == 201
+    assert "100.0 % in 30 days, 100.0 % in those before" in tile(home, "Mean")
+    assert "no photograph was forecast in 7 days" in tile(home, "Mean", "7")
+    assert "in 90 days, nothing to compare before" in tile(home, "Mean", "90")
+    assert "100.0 % of photographs as they came" in tile(home, "Mean", "all")
+    assert "0 of 1 evaluated" in tile(home, "Below")
+    assert tile(home, "Worst") .endswith(": AA39 100.0 %")
+    assert tile(home, "Last") .startswith(f"{made[10]:%Y-%m-%d %H:%M} UTC")
+    assert tile(home, "Jobs") .endswith(": 0 waiting, 0 failed in 30 days")
+    page = text_of(home, "/?period=7")
+    assert "Updated 20" in page.one(id="state").words
+    assert page.one("input", name="period")["value"] == "7"  # the filter keeps it

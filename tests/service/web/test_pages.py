@@ -160,7 +160,7 @@ def test_field_shows_every_figure_as_colour_and_as_number(shown: TestClient, met
     page = settled(shown, f"/?metric={metric}")
     assert f'<h2 id="map-title">{METRICS[metric].label}</h2>' in page
     mark = page.one("path", class_="mirrors", data_names="AA39")
-    assert re.fullmatch("#[0-9a-f]{6}", mark["fill"])
+    assert re.fullmatch(r"var\(--s[0-8]\)", mark["fill"])
     number = mark["data-texts"].split("\N{NO-BREAK SPACE}")[0]
     assert f'<td class="number">{number}' in page
 
@@ -180,7 +180,7 @@ def test_surface_made_from_all_photographs_is_not_yet_evaluated(pages: TestClien
 
 
 def test_colours_mean_the_same_in_every_field(tmp_path: Path):
-    """What is fine is blue, also the worst heliostat of the field; the ends are settings."""
+    """What is fine recedes, also the worst heliostat of the field; the ends are settings."""
     colours = {}
     for name, scales in (
         ("usual", {}),
@@ -195,7 +195,7 @@ def test_colours_mean_the_same_in_every_field(tmp_path: Path):
             client.put("/v1/heliostats/AA39", json=properties_document())
             fill(client)
             colours[name] = settled(client).one("path", class_="mirrors")["fill"]
-    assert colours == {"usual": "#5b95b8", "strict": "#5b95b8", "lax": "#d62020"}
+    assert colours == {"usual": "var(--s0)", "strict": "var(--s0)", "lax": "var(--s8)"}
 
 
 def test_accuracy_is_computed_once_for_each_surface(pages: TestClient, operations: FakeOperations):

@@ -69,7 +69,7 @@ def test_newest_photographs_are_held_against_the_mount(
         assert "m on the receiver" in answer.replace("\N{NO-BREAK SPACE}", " ")
         assert 'href="/calibration-plan"' in answer
     assert "A photograph is most informative <time" in page
-    assert re.fullmatch("#[0-9a-f]{6}", Page(field).one("path", class_="mirrors")["fill"])
+    assert re.fullmatch(r"var\(--s[0-8]\)", Page(field).one("path", class_="mirrors")["fill"])
     metrics = client.get("/metrics").text
     assert 'heliotwin_heliostat_pointing_error_mrad{heliostat="AA39"} ' in metrics
     assert 'heliotwin_heliostat_pointing_error_metres{heliostat="AA39"} ' in metrics
