@@ -70,8 +70,8 @@ class FieldView(HeliostatFilter):
 class Marks:
     """Heliostats of one colour on the map, as a path of squares.
 
-    ``step`` is the place of the colour from fine, 0, to poor, `STEPS` - 1. It is None if the values are not known. ``names`` and ``texts``, the formatted values,
-    are in the order of the path.
+    ``step`` is the place of the colour from fine, 0, to poor, `STEPS` - 1. It is None if the values
+    are not known. ``names`` and ``texts``, the formatted values, are in the order of the path.
     """
 
     step: int | None
@@ -234,7 +234,8 @@ def draw(
 ) -> Drawing:
     """Draw the map of ``lines``, with the ``chosen`` ones emphasized.
 
-    ``ends`` are the values that are fine and poor, where the colours end. The tower, at the origin, is always on the map.
+    ``ends`` are the values that are fine and poor, where the colours end. The tower, at the
+    origin, is always on the map.
     """
     east = np.array([line.east_m for line in lines] + [0.0])
     north = np.array([line.north_m for line in lines] + [0.0])
@@ -300,7 +301,9 @@ def get_field(
     """The state of the field, its map with the filtered heliostats emphasized, and their table."""
     with runtime.database.reading() as session:
         now, plant = cache.read(session), session.get(PlantRow, 1)
-        work = cache.recent(session, ("work", view.period), partial(recent_work, session, view.period))
+        work = cache.recent(
+            session, ("work", view.period), partial(recent_work, session, view.period)
+        )
         zone = plant_time_zone(session, runtime.settings.time_zone)
     lines, chosen = now.lines, METRICS[view.metric]
     limit, ends = runtime.settings.attention_accuracy, runtime.settings.map_scales[view.metric]

@@ -129,8 +129,8 @@ def tile(client: TestClient, label: str, period: str = "30") -> str:
 
 
 def test_tiles_have_the_state_of_the_plant(home: TestClient):
-    assert tile(home, "Alarms") .endswith(": 0 act now, 0 act today, 3 when there is time")
-    assert tile(home, "Mean") .endswith(": no photograph was forecast in 30 days")
+    assert tile(home, "Alarms").endswith(": 0 act now, 0 act today, 3 when there is time")
+    assert tile(home, "Mean").endswith(": no photograph was forecast in 30 days")
     send, made = poster(home), {}
     for seed, days in enumerate((50, 45, 10)):
         at = (now() - timedelta(days=days)).replace(hour=11, minute=0)
@@ -147,9 +147,9 @@ def test_tiles_have_the_state_of_the_plant(home: TestClient):
     assert "in 90 days, nothing to compare before" in tile(home, "Mean", "90")
     assert "100.0 % of photographs as they came" in tile(home, "Mean", "all")
     assert "0 of 1 evaluated" in tile(home, "Below")
-    assert tile(home, "Worst") .endswith(": AA39 100.0 %")
-    assert tile(home, "Last") .startswith(f"{made[10]:%Y-%m-%d %H:%M} UTC")
-    assert tile(home, "Jobs") .endswith(": 0 waiting, 0 failed in 30 days")
+    assert tile(home, "Worst").endswith(": AA39 100.0 %")
+    assert tile(home, "Last").startswith(f"{made[10]:%Y-%m-%d %H:%M} UTC")
+    assert tile(home, "Jobs").endswith(": 0 waiting, 0 failed in 30 days")
     page = text_of(home, "/?period=7")
     assert "Updated 20" in page.one(id="state").words
     assert page.one("input", name="period")["value"] == "7"  # the filter keeps it
