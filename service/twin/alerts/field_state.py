@@ -83,12 +83,13 @@ def recent_work(session: Session, period: Period) -> RecentWork:
     at, row = now(), MeasurementRow
     length = None if period == "all" else timedelta(days=int(period))
     since = datetime.min.replace(year=1970, tzinfo=at.tzinfo) if length is None else at - length
-    accuracies: list[float | None] = []
-    for first, last in ((since, at), (since if length is None else since - length, since)):
+
+    def mean(first: datetime, last: datetime) -> float | None:
         of_arrival = select(func.avg(row.forecast_accuracy)).where(
             row.forecast_accuracy.is_not(None), row.taken_at >= first, row.taken_at < last
         )
-        accuracies.append(session.scalar(of_arrival))
+        return session.scalar(of_arrival)
+
     newest = select(HeliostatRow.name, row.identifier, row.taken_at).join(
         HeliostatRow, HeliostatRow.id == row.heliostat_id
     )
@@ -101,9 +102,15 @@ def recent_work(session: Session, period: Period) -> RecentWork:
             for condition in (JobRow.state == "running", JobRow.state == "queued", is_failed)
         )
     ).where(or_(JobRow.state.in_(("running", "queued")), is_failed))
+    running, queued, failed = map(int, session.execute(counted).one())
     return RecentWork(
-        *accuracies,
-        *((None, None, None) if found is None else found),
-        *map(int, session.execute(counted).one()),
+        mean(since, at),
+        None if length is None else mean(since - length, since),
+        None if found is None else found[0],
+        None if found is None else found[1],
+        None if found is None else found[2],
+        running,
+        queued,
+        failed,
         at,
     )
