@@ -59,6 +59,7 @@ from service.store.results import (
     recent_field_forecasts,
     recent_forecasts,
     study_findings,
+    times_of_photographs,
 )
 from service.store.rows import Change, insert, serialize_writers
 from service.store.surfaces.surface_versions import (
@@ -150,5 +151,6 @@ __all__ = [
     "stored_tower",
     "study_findings",
     "target_plane",
+    "times_of_photographs",
     "use_image",
 ]

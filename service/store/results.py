@@ -1,6 +1,6 @@
 """Storage of forecasts and studies, and row counts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, cast
@@ -219,6 +219,18 @@ def study_findings(session: Session, studies: Sequence[int]) -> dict[int, StudyF
     query = select(StudyRow.id, report["effects"], report["unexplained_share"].as_float())
     rows = session.execute(query.where(StudyRow.id.in_(studies)))
     return {number: StudyFindings(effects, share) for number, effects, share in rows}
+
+
+def times_of_photographs(session: Session, keys: Iterable[str]) -> dict[str, datetime | None]:
+    """When photographs were taken, by ``heliostat/id`` as in reports; deleted ones are missing."""
+    pairs = [key.partition("/")[::2] for key in keys]
+    query = (
+        select(HeliostatRow.name, MeasurementRow.identifier, MeasurementRow.taken_at)
+        .join(MeasurementRow, MeasurementRow.heliostat_id == HeliostatRow.id)
+        .where(HeliostatRow.name.in_({name for name, _ in pairs}))
+        .where(MeasurementRow.identifier.in_({identifier for _, identifier in pairs}))
+    )
+    return {f"{name}/{identifier}": at for name, identifier, at in session.execute(query)}
 
 
 _COUNTED: dict[str, type[Base]] = {

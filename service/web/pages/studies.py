@@ -13,6 +13,7 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.tables import PlantRow
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.studies.changes import (
     EACH_S,
@@ -30,6 +31,7 @@ from service.web.auth.dependencies import (
     IdentityDep,
     RuntimeDep,
 )
+from service.web.pages.study_charts import study_timelines
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False)
@@ -96,10 +98,13 @@ def get_study_page(number: Number, request: Request, runtime: RuntimeDep) -> HTM
         state = study_states(session, [row])[number]
         current = model_versions.current_number(session)
         outdated = store.outdated_surfaces(session, model_versions.current_version(session))
-    report = CheckedStudyReport.model_validate(row.report)
+        report = CheckedStudyReport.model_validate(row.report)
+        taken = store.times_of_photographs(session, report.before.per_image)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
     return render(
         request,
         "studied.html",
+        timelines=study_timelines(report, taken, zone),
         study=row,
         report=report,
         parameters=[

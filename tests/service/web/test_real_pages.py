@@ -160,3 +160,4 @@ def test_a_parameter_is_shown_with_its_scope(every_study: TestClient):
         "camera response since 2024-06-16, gamma",
     ):
         assert text in shown
+    assert "sun shape, circumsolar_ratio [1]" in every_study.get("/studies/9").text  # over days

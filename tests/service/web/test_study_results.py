@@ -76,6 +76,29 @@ def test_not_explained(studied: Studied):
     assert client.get("/v1/studies/1").json()["state"] == "nothing_to_adopt"
 
 
+def test_accuracies_over_time(real_client: TestClient):
+    """Times that are given after a study count, because they are read when the page is shown."""
+    assert not text_of(real_client, "/studies/1").all("figure", class_="timeline")
+    keys = list(real_client.get("/v1/studies/1").json()["before"]["per_image"])
+    times = [
+        {
+            "heliostat": key.partition("/")[0],
+            "id": key.partition("/")[2],
+            "taken_at": f"2024-06-{number + 1:02}T10:00:00Z",
+        }
+        for number, key in enumerate(keys[1:])
+    ]
+    body = {"reason": "the log of the camera", "times": times}
+    assert real_client.patch("/v1/measurements/times", json=body).status_code == 200
+    page = text_of(real_client, "/studies/1")
+    (chart,) = page.all("figure", class_="timeline")
+    assert "before: 4 values" in chart.words
+    assert "after: 4 values" in chart.words
+    assert "Time unknown, so not drawn: 1 of before" in chart.words
+    sheet = real_client.get("/studies/1?figure=timeline-1&format=csv").text
+    assert sheet.count("2024-06-") == 8
+
+
 def test_too_few_photographs_end_the_job_with_the_reason(real_client: TestClient):
     answer = real_client.post("/v1/studies", json={"heliostats": ["AA39"], "images": 2})
     assert real.worker(real_client).work()
