@@ -54,6 +54,7 @@ PATHS = (
     "/photographs",
     "/photographs/times",
     "/photographs/review",
+    "/photographs/upload",
     "/forecast",
     "/forecasts/1",
     "/studies",

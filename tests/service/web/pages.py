@@ -66,6 +66,7 @@ PATHS = (
     "/photographs",
     "/photographs/times",
     "/photographs/review",
+    "/photographs/upload",
     "/forecast",
     "/forecast?heliostat=AA39",
     "/forecasts/1",
