@@ -136,13 +136,18 @@ class LikelyCause:
         return CAUSES[self.kind]
 
 
+def percent(share: float) -> str:
+    """A share [1] as a percentage, as pages write it."""
+    return f"{100 * share:.1f}\N{NO-BREAK SPACE}%"
+
+
 def count_photographs(count: int) -> str:
     """A number of photographs in words."""
     return f"{count} photograph{'' if count == 1 else 's'}"
 
 
 def outlier_reasons(facts: HeliostatFacts) -> dict[str, str]:
-    """Why each photograph is an outlier, by identifier; photographs that are none are left out."""
+    """Why each outlier is one, by identifier, the worst first; other photographs are left out."""
     known = [one.accuracy for one in facts.photographs if one.accuracy is not None]
     usual = median(known) if known else 0.0
     in_time = sorted(
@@ -163,12 +168,13 @@ def outlier_reasons(facts: HeliostatFacts) -> dict[str, str]:
             said.append("the surface does not explain it, although it was made from it")
         if one.accuracy is not None and (one.identifier in far or one.accuracy < facts.limit):
             said.append(
-                f"it is forecast with an accuracy of {one.accuracy:.0%}, the others with"
-                f" {usual:.0%} in the median"
+                f"it is forecast with an accuracy of {percent(one.accuracy)}, the others with"
+                f" {percent(usual)} in the median"
             )
         if said:
             reasons[one.identifier] = "; ".join(said)
-    return reasons
+    known_of = {one.identifier: one.accuracy for one in facts.photographs}
+    return dict(sorted(reasons.items(), key=lambda one: known_of[one[0]] or 0.0))
 
 
 def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
@@ -231,7 +237,7 @@ def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[Likel
     if not apart or len(poor) > len(usual):
         return []
     values = [one.accuracy for one in apart if one.accuracy is not None]
-    worst = f", {min(values):.0%} accurate at worst" if values else ""
+    worst = f", {percent(min(values))} accurate at worst" if values else ""
     said = (
         f"{count_photographs(len(apart))} of {len(facts.photographs)} contradict the others{worst}"
     )
@@ -265,12 +271,12 @@ def _haze(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
         if one.identifier in poor and one.taken_at is not None and one.taken_at.date() == day
     ]
     values = [one.accuracy for one in own if one.accuracy is not None]
-    mine = f" ({median(values):.0%})" if values else ""
+    mine = f" ({percent(median(values))})" if values else ""
     said = (
         f"on {day:%Y-%m-%d}, not only {count_photographs(len(own))} of it{mine} but also"
         f" {count_photographs(other.photographs)} of {other.heliostats} other heliostat"
-        f"{'' if other.heliostats == 1 else 's'} were forecast with {other.accuracy:.0%} instead of"
-        f" {other.usual:.0%}"
+        f"{'' if other.heliostats == 1 else 's'} were forecast with {percent(other.accuracy)} instead of"
+        f" {percent(other.usual)}"
     )
     (cause,) = _of_photographs("haze", own, poor, said)
     return [replace(cause, day=day)]
@@ -336,8 +342,8 @@ def _model(facts: HeliostatFacts) -> list[LikelyCause]:
     if not excess:
         return []
     said = (
-        f"its surface misses {facts.misfit:.0%} of the photographs that it was made from;"
-        f" {facts.usual_misfit:.0%} is the field's median"
+        f"its surface misses {percent(facts.misfit)} of the photographs that it was made from;"
+        f" {percent(facts.usual_misfit)} is the field's median"
     )
     return [LikelyCause("model", excess, said)]
 
@@ -420,7 +426,9 @@ def _study(session: Session, heliostat: str) -> StudyFinding | None:
         return None
     if model_versions.find_adopted(session, study.id) is not None:
         return None
-    return StudyFinding(study.id, f"study {study.id} of its photographs: {study.conclusion}")
+    return StudyFinding(
+        study.id, f"study {study.id} of its photographs: {study.conclusion.rstrip('.')}"
+    )
 
 
 def is_poor(

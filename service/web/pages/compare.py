@@ -28,6 +28,7 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline, Value
+from service.store.columns import EPOCH
 from service.store.listing import Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
@@ -37,7 +38,7 @@ from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_req
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import ComparisonResult
+from service.twin.surfaces.accuracy import RECENT, ComparisonResult
 from service.web.auth.dependencies import COMPUTE_SLOT, READ, RENDER_SLOT, RuntimeDep
 from service.web.pages.forecast import sun_now
 from service.web.pages.heliostat import ComparisonCacheDep, newest_surfaces
@@ -311,7 +312,10 @@ def _timelines(
 
 
 def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
-    """Mean accuracies [1] on photographs that neither surface was made from, and their number."""
+    """Mean accuracies [1] on photographs that neither surface was made from, and their number.
+
+    They are the `RECENT` newest, as when a new surface is judged.
+    """
     found = [{c.measurement.id: c for c in one.comparisons} for one in compared]
     either = found[0].keys() & found[1].keys() or found[0].keys() | found[1].keys()
     fair = {
@@ -319,8 +323,12 @@ def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
         for number in either
         if not any(one[number].was_used for one in found if number in one)
     }
-    means = [[c.accuracy for number, c in one.items() if number in fair] for one in found]
-    return [fmean(some) for some in means if some], len(fair)
+    taken = {number: c.measurement.taken_at for one in found for number, c in one.items()}
+    newest = sorted(fair, key=lambda number: (taken[number] or EPOCH, number), reverse=True)[
+        :RECENT
+    ]
+    means = [[one[number].accuracy for number in newest if number in one] for one in found]
+    return [fmean(some) for some in means if some], len(newest)
 
 
 # --- the page

@@ -31,6 +31,7 @@ from service.twin.studies.study import (
     study_row,
 )
 from tests.model.scenes import photographs
+from tests.page import Page
 from tests.service import real
 from tests.service.web.crawling import crawl
 
@@ -161,3 +162,28 @@ def test_a_parameter_is_shown_with_its_scope(every_study: TestClient):
     ):
         assert text in shown
     assert "sun shape, circumsolar_ratio [1]" in every_study.get("/studies/9").text  # over days
+
+
+def test_accuracy_of_a_surface_is_the_same_on_all_pages(real_client: TestClient):
+    """It was 87.5, 87.9 and 90.1 %, and no page said of which photographs."""
+    real_client.headers.update({"Accept": "text/html"})
+    decided = real_client.get(
+        "/v1/heliostats/AA39/surfaces/decisions", headers={"Accept": "application/json"}
+    ).json()["items"][0]
+    before, after = (
+        f"{100 * decided[name]:.1f}\N{NO-BREAK SPACE}%"
+        for name in ("accuracy_before", "accuracy_after")
+    )
+    page = Page(real_client.get("/heliostats/AA39?candidate=2").text)
+    assert (
+        f"on the same 5 photographs for both: {before} with version 1, {after} with" in page.words
+    )
+    assert "above are of the 8 newest that version 1 was not made from" in page.words
+    candidate = Page(real_client.get("/heliostats/AA39?version=2").text)
+    assert (
+        f"{after}mean on 5 photographs that it was not made from"
+        in candidate.one("dl", class_="tiles").words
+    )
+    compared = Page(real_client.get("/compare?heliostat=AA39&version=1&other_version=2").text)
+    assert compared.cells("Forecast accuracy")[:2] == [before, after]
+    assert "the 5 newest photographs that neither was made from" in compared.words
