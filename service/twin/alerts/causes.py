@@ -333,17 +333,16 @@ def _few_suns(facts: HeliostatFacts) -> list[LikelyCause]:
 
 
 def _model(facts: HeliostatFacts) -> list[LikelyCause]:
-    excess = 0.0
-    if facts.misfit and facts.usual_misfit and facts.misfit > _MISFIT_RATIO * facts.usual_misfit:
-        excess = 1 - facts.usual_misfit / facts.misfit
+    misfit, usual = facts.misfit or 0.0, facts.usual_misfit or 0.0
+    excess = 1 - usual / misfit if usual and misfit > _MISFIT_RATIO * usual else 0.0
     if facts.study is not None:
         number, said = facts.study
         return [LikelyCause("model", max(excess, 0.25), said, study=number)]
     if not excess:
         return []
     said = (
-        f"its surface misses {percent(facts.misfit)} of the photographs that it was made from;"
-        f" {percent(facts.usual_misfit)} is the field's median"
+        f"its surface misses {percent(misfit)} of the photographs that it was made from;"
+        f" {percent(usual)} is the field's median"
     )
     return [LikelyCause("model", excess, said)]
 

@@ -51,7 +51,7 @@ def test_versions_are_compared_with_their_forecasts(pages: TestClient, operation
     assert [made["resolution"] for made in operations.forecasts[-2:]] == [(128, 128)] * 2
     assert "they agree by 100.0" in page
     # Only the third photograph has been seen by neither.
-    assert "of 1 photographs that neither was made from" in page
+    assert "the 1 newest photographs that neither was made from" in page
     accuracies = page.cells("Forecast accuracy")[:2]
     assert [accuracy.split() for accuracy in accuracies] == [["100.0", "%"]] * 2
 
