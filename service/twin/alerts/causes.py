@@ -275,8 +275,8 @@ def _haze(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
     said = (
         f"on {day:%Y-%m-%d}, not only {count_photographs(len(own))} of it{mine} but also"
         f" {count_photographs(other.photographs)} of {other.heliostats} other heliostat"
-        f"{'' if other.heliostats == 1 else 's'} were forecast with {percent(other.accuracy)} instead of"
-        f" {percent(other.usual)}"
+        f"{'' if other.heliostats == 1 else 's'} were forecast with"
+        f" {percent(other.accuracy)} instead of {percent(other.usual)}"
     )
     (cause,) = _of_photographs("haze", own, poor, said)
     return [replace(cause, day=day)]
