@@ -28,18 +28,19 @@ def times(
     from service.base.settings import Settings
     from service.sources.files import require_regular
     from service.store.database import require_store
-    from service.twin.photographs.times import correct_times, read_times
+    from service.twin.photographs.batches import correct_many
+    from service.twin.photographs.times import TIMES, read_times
     from service.twin.runtime.runtime import Runtime
 
     with require_regular(file).open(encoding="utf-8-sig", newline="") as lines:
-        given = read_times(lines, str(file))
+        given = read_times(lines, str(file), reason)
     require_reason(reason)
     settings = Settings()
     require_store(settings)
     runtime = Runtime.from_settings(settings)
     try:
         runtime.database.require_current()
-        changed = correct_times(runtime, given, reason, actor())
+        changed = correct_many(runtime, given, reason, actor(), TIMES)
     finally:
         runtime.close()
     report = {"given": len(given), "changed": changed}

@@ -259,7 +259,8 @@ def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> I
 
 
 _GIVE_TIMES = (
-    "give the times of its photographs (PATCH /v1/measurements/times, or `heliotwin times FILE`)"
+    "give the times of its photographs (page /photographs/times, PATCH /v1/measurements/times, or"
+    " `heliotwin times FILE`)"
 )
 
 

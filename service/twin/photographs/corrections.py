@@ -45,8 +45,8 @@ _MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m",
 class PhotographChanges:
     """Corrected metadata of a photograph; None leaves a value unchanged.
 
-    ``excluded`` is whether the photograph is excluded from all computations. ``without_time``
-    removes a time that was wrong.
+    ``excluded`` is whether the photograph is excluded from all computations. ``without``
+    names metadata to remove: ``taken_at``, ``motor_position``.
     """
 
     reason: str
@@ -56,7 +56,7 @@ class PhotographChanges:
     motor_position: tuple[float, float] | None = None
     weather: Weather = field(default_factory=Weather)
     excluded: bool | None = None
-    without_time: bool = False
+    without: tuple[str, ...] = ()
 
     def of(self, row: MeasurementRow) -> Photograph:
         """The stored photograph with the changes applied."""
@@ -64,9 +64,8 @@ class PhotographChanges:
         stored = photograph_from_row(row)
         weather = {name: value for name, value in vars(self.weather).items() if value is not None}
         changes = {name: value for name in names if (value := getattr(self, name)) is not None}
-        without = {"taken_at": None} if self.without_time else {}
-        weather_now = replace(stored.weather, **weather)
-        return replace(stored, weather=weather_now, **(changes | without))
+        changes |= dict.fromkeys(self.without)
+        return replace(stored, weather=replace(stored.weather, **weather), **changes)
 
 
 def correct_photograph(
@@ -100,15 +99,15 @@ def correct_photograph(
 class PreparedCorrection:
     """A correction before it is written.
 
-    ``fresh`` are the columns to write, by identifier of the photograph's images. ``taken_at`` is
-    the stored time.
+    ``fresh`` are the columns to write, by identifier of the photograph's images. ``row`` is the
+    stored image that was named.
     """
 
     heliostat: str
     identifier: str
     changes: PhotographChanges
     fresh: dict[str, dict[str, object]]
-    taken_at: datetime | None
+    row: MeasurementRow
 
 
 def prepare_correction(
@@ -118,7 +117,7 @@ def prepare_correction(
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat)
         row = store.get_measurement(session, twin.row, identifier)
-        taken_at, images = row.taken_at, images_of_photograph(session, row)
+        images = images_of_photograph(session, row)
         named = (
             None if changes.target_name is None else store.get_target(session, changes.target_name)
         )
@@ -126,7 +125,7 @@ def prepare_correction(
         row.identifier: _new_values(runtime, twin, row, changes.of(row), named or row.target)
         for row in images.values()
     }
-    return PreparedCorrection(heliostat, identifier, changes, fresh, taken_at)
+    return PreparedCorrection(heliostat, identifier, changes, fresh, row)
 
 
 def apply_correction(

@@ -4,7 +4,8 @@ from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
 from service.base.fields import MeasurementName, Model, Moment, Name, Reason
-from service.twin.photographs.times import MOST_TIMES, GivenTime, correct_times
+from service.twin.photographs.batches import MOST_ENTRIES, correct_many
+from service.twin.photographs.times import TIMES, given_time
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -30,7 +31,9 @@ class TimesIn(Model):
 
     reason: Reason = Field(description="Where they come from; kept with each correction.")
     times: list[TimeIn] = Field(
-        min_length=1, max_length=MOST_TIMES, description="The times, by heliostat and measurement."
+        min_length=1,
+        max_length=MOST_ENTRIES,
+        description="The times, by heliostat and measurement.",
     )
 
 
@@ -52,7 +55,8 @@ def patch_times(runtime: RuntimeDep, identity: IdentityDep, body: TimesIn) -> Ti
     Either all are set, or none. Each is a correction with its history. `errors` names every wrong
     entry by its index, such as `times.3`. Entries that match the stored time are skipped.
     """
-    given = [GivenTime(entry.heliostat, entry.id, entry.taken_at) for entry in body.times]
-    return TimesOut(
-        given=len(given), changed=correct_times(runtime, given, body.reason, identity.name)
-    )
+    given = [
+        given_time(entry.heliostat, entry.id, entry.taken_at, body.reason) for entry in body.times
+    ]
+    changed = correct_many(runtime, given, body.reason, identity.name, TIMES)
+    return TimesOut(given=len(given), changed=changed)

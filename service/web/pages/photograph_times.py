@@ -1,8 +1,8 @@
-"""Page that gives times to many photographs: by lines or an offset, with a preview and undo."""
+"""Page that gives times and motor positions to many photographs, with a preview and undo."""
 
 import csv
 import io
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, File, Form, Path, Query, Request, Response, UploadFile
 from fastapi.responses import HTMLResponse
@@ -14,16 +14,15 @@ from model.times import format_time
 from service.base.fields import Model, Reason, Version
 from service.store.tables import HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.photographs.times import (
-    MOST_TIMES,
-    GivenTime,
-    correct_times,
-    list_time_changes,
-    preview_times,
-    read_times,
-    shifted_times,
-    undo_times,
+from service.twin.photographs.batches import (
+    MOST_ENTRIES,
+    GivenCorrection,
+    correct_many,
+    list_batches,
+    preview_many,
+    undo_batch,
 )
+from service.twin.photographs.times import MOTORS, TIMES, read_motors, read_times, shifted_times
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -41,6 +40,9 @@ _MAX_CSV = 2**20  # [bytes]
 _LISTED = 5
 
 
+What = Literal["times", "motors"]
+
+
 class ShiftForm(PhotographsQuery):
     """The form that shifts the known times of a selection by ``minutes``."""
 
@@ -53,6 +55,7 @@ class TimesForm(Model):
 
     lines: str
     reason: Reason
+    what: What = "times"
 
 
 def _counts(runtime: Runtime) -> list[tuple[str, int]]:
@@ -83,30 +86,43 @@ def get_times_page(
             counts=_counts(runtime),
             targets=target_names(session),
             zone=plant_time_zone(session, runtime.settings.time_zone),
-            recent=list_time_changes(session, _LISTED),
+            recent=list_batches(session, _LISTED),
         )
 
 
 def _preview(
-    request: Request, runtime: Runtime, times: list[GivenTime], reason: str
+    request: Request, runtime: Runtime, given: list[GivenCorrection], what: What, reason: str
 ) -> HTMLResponse:
-    if len(times) > MOST_TIMES:
-        raise InvalidInputError(f"lines: {len(times)} times; give at most {MOST_TIMES} at once")
-    changes = preview_times(runtime, times)
+    if len(given) > MOST_ENTRIES:
+        raise InvalidInputError(f"lines: {len(given)} entries; give at most {MOST_ENTRIES} at once")
+    changes = preview_many(runtime, what, given)
     lines = io.StringIO()
     csv.writer(lines).writerows(
-        (one.given.heliostat, one.given.identifier, format_time(one.given.taken_at))
-        for one in changes
-        if one.given.taken_at is not None
+        (one.given.heliostat, one.given.identifier, *_values(one.given)) for one in changes
     )
     return render(
         request,
         "photograph_times_preview.html",
         changes=changes,
-        unchanged=len(times) - len(changes),
+        unchanged=len(given) - len(changes),
         lines=lines.getvalue(),
+        what=what,
         reason=reason,
     )
+
+
+def _values(given: GivenCorrection) -> tuple[object, ...]:
+    at, motors = given.changes.taken_at, given.changes.motor_position
+    return (() if at is None else (format_time(at),)) + (motors or ())
+
+
+def _read(
+    lines: str, where: str, what: What, reason: str, zone: str | None
+) -> list[GivenCorrection]:
+    text = lines.splitlines()
+    if what == "motors":
+        return read_motors(text, where, reason)
+    return read_times(text, where, reason, zone)
 
 
 @router.post("/preview", dependencies=[Depends(require_multipart), COMPUTE_SLOT])
@@ -114,6 +130,7 @@ def post_lines_form(
     request: Request,
     runtime: RuntimeDep,
     reason: Annotated[Reason, Form()],
+    what: Annotated[What, Form()] = "times",
     lines: Annotated[str, Form(max_length=_MAX_CSV)] = "",
     file: Annotated[UploadFile | None, File()] = None,
 ) -> HTMLResponse:
@@ -124,8 +141,8 @@ def post_lines_form(
     with runtime.database.reading() as session:
         zone = plant_time_zone(session, runtime.settings.time_zone)
     text = data.decode("utf-8-sig", "replace") if data else lines
-    times = read_times(text.splitlines(), "file" if data else "lines", zone)
-    return _preview(request, runtime, times, reason)
+    given = _read(text, "file" if data else "lines", what, reason, zone)
+    return _preview(request, runtime, given, what, reason)
 
 
 @router.post("/shift", dependencies=[COMPUTE_SLOT])
@@ -134,17 +151,18 @@ def post_shift_form(
 ) -> HTMLResponse:
     """What an offset would change; nothing is stored."""
     with runtime.database.reading() as session:
-        times = shifted_times(session, form.filter(session), form.minutes)
-    return _preview(request, runtime, times, form.reason)
+        given = shifted_times(session, form.filter(session), form.minutes, form.reason)
+    return _preview(request, runtime, given, "times", form.reason)
 
 
 @router.post("", dependencies=[COMPUTE_SLOT])
 def post_times_form(
     form: Annotated[TimesForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
-    """Store the times, and return to the page, which can undo them."""
-    times = read_times(form.lines.splitlines(), "lines")
-    correct_times(runtime, times, form.reason, identity.name)
+    """Store what the preview showed, and return to the page, which can undo them."""
+    given = _read(form.lines, "lines", form.what, form.reason, None)
+    action = MOTORS if form.what == "motors" else TIMES
+    correct_many(runtime, given, form.reason, identity.name, action)
     return go_to("/photographs/times#recent-title")
 
 
@@ -154,6 +172,6 @@ def post_undo_form(
     runtime: RuntimeDep,
     identity: IdentityDep,
 ) -> Response:
-    """Restore the times before a change, and return to the page."""
-    undo_times(runtime, number, identity.name)
+    """Restore the values before a change, and return to the page."""
+    undo_batch(runtime, number, identity.name)
     return go_to("/photographs/times#recent-title")

@@ -89,7 +89,7 @@ def test_a_file_and_the_plants_zone(client: TestClient, tower: Any, taken: list[
     answer = _preview(client, "", file=("times.csv", content, "text/csv"))
     assert "2024-05-01 10:00" in answer.text
     contradicting = _preview(client, "AA39,0,2024-05-01T22:00:00")
-    assert "The sun contradicts 1 of these times" in contradicting.text
+    assert "The sun contradicts the time of 1." in contradicting.text
 
 
 @pytest.mark.parametrize(
@@ -114,3 +114,21 @@ def test_undated_photographs_are_a_group_at_the_end(client: TestClient, post: Po
     rows = text_of(client, "/photographs").one("table", id="photographs").all("tr")[1:]
     assert [row.words == "Time unknown" for row in rows] == [False, True, False, False, False]
     assert "dated" in rows[0].words
+
+
+def test_motor_positions_are_previewed_stored_and_undone(client: TestClient, post: Post):
+    assert post(png(1), id="1").status_code == 201
+    path = "/v1/heliostats/AA39/measurements/1"
+    form = {"lines": "AA39,1,30076,37935", "what": "motors", "reason": "from the drives' log"}
+    preview = client.post(f"{PATH}/preview", data=form, files={"file": ("", b"")}, headers=HTML)
+    assert "Store 1 motors" in preview.text
+    assert client.get(path).json()["motor_position"] is None
+    client.post(PATH, data=form, headers=HTML)
+    assert client.get(path).json()["motor_position"] == [30076, 37935]
+    number = client.get("/v1/audit").json()["items"][0]["id"]
+    assert client.post(f"{PATH}/{number}/undo", headers=HTML).status_code == 200
+    assert client.get(path).json()["motor_position"] is None
+    wrong = form | {"lines": "AA39,1,30076,x"}
+    refused = client.post(f"{PATH}/preview", data=wrong, files={"file": ("", b"")}, headers=HTML)
+    assert refused.status_code == 422
+    assert "lines" in refused.text

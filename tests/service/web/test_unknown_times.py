@@ -121,7 +121,7 @@ def test_attention_asks_for_times_and_goes_by_those_that_are_known(
         == f"the last accepted one is of {last:%Y-%m-%d}; the time of 2 more is unknown"
     )
     assert attention(client, "times_unknown") == []
-    assert "Times unknown" not in client.get("/attention", headers=HTML).text
+    assert "<td>Times unknown</td>" not in client.get("/attention", headers=HTML).text
 
 
 def test_undated_photographs_are_no_news(client: TestClient, post: Post):
