@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.aiming.kernels import Kernels, Thinned
+from model.aiming.kernels import SIZE, Kernels, Thinned
 from model.errors import InvalidInputError
 from model.progress import nothing_between
 
@@ -270,8 +270,9 @@ class _Ascent:
         self.kernels, self.limit = plan.kernels, plan.limit
         self.active = plan.is_active.to(plan.moved)
         spread = image_spread(self.kernels)
-        # Steps in units of the images' spread: far and near mirrors move alike.
-        self.unit = spread.mean(dim=1, keepdim=True)
+        # Steps in units of the images' spread: far and near mirrors move alike. The image of a
+        # mirror in full shadow has none.
+        self.unit = torch.maximum(spread.mean(dim=1), self.kernels.sides / SIZE)[:, None]
         self.places = (plan.moved / self.unit).requires_grad_()
         self.multipliers = plan.multipliers.clone()
         self.step = step

@@ -82,6 +82,22 @@ def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
     assert again["peak_p95_w_m2"] <= 1.002 * 80e3
 
 
+def test_a_heliostat_in_the_towers_shadow_does_not_spoil_the_plan(tmp_path: Path):
+    file = write_aim_plant(tmp_path / "plant")
+    with file.open("a") as plant:
+        plant.write("tower: {radius_m: 12, height_m: 75}\n")
+    (tmp_path / "plant" / "layout.csv").write_text(
+        "name,type,east_m,north_m,up_m\ndark,large,0,30,0\nlit,large,60,150,0\n"
+    )
+    with real.client_on(tmp_path / "store") as client:
+        folder = read_folder(tmp_path / "plant", whole_field=True)
+        import_folder(real.runtime_of(client), folder)
+        result = planned(client)["result"]
+        alone = planned(client, heliostats=["lit"])["result"]
+    assert result["power_w"] == pytest.approx(alone["power_w"], rel=5e-3)
+    assert result["power_w"] <= result["bound_w"]
+
+
 def test_limit_over_the_map(plant: TestClient):
     result = planned(plant, limit_w_m2=[[200e3, 200e3], [70e3, 70e3]])["result"]
     assert result["limit_w_m2"] == pytest.approx(200e3)
