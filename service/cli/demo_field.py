@@ -27,7 +27,7 @@ from model.sunshape import Buie
 from model.surface import control_points
 from model.times import format_time
 from service.base.progress import Progress, no_progress
-from service.cli.demo_photographs import DEVIATION
+from service.cli.demo_photographs import DEVIATION, write_surface
 from service.cli.folder import write_json
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import LAYOUT, PLANT
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 FIELD = """\
 # The field of `heliotwin demo`: mirrors of Juelich's kind, of which some have faults.
-plant: {name: field, latitude_deg: 37.1, longitude_deg: -2.36, altitude_m: 500, time_zone: Europe/Madrid}
+plant: {name: example, latitude_deg: 37.1, longitude_deg: -2.36, altitude_m: 500, time_zone: Europe/Madrid}
 heliostat_types:
   four-facets:
     mount:
@@ -89,14 +89,17 @@ class Fault:
     size : float
         Share of light that is lost, angle [mrad] or time [h].
     alarm : str or None
-        The alarm's reason that it raises; None if pages show it without an alarm.
+        The reason of the alarm that it raises, if any.
+    refusal : str or None
+        The reason why its photographs are refused, if they are.
     """
 
     kind: str
     heliostats: tuple[str, ...]
     days: tuple[float, float]
     size: float
-    alarm: str | None
+    alarm: str | None = None
+    refusal: str | None = None
 
     def acts(self, name: str, days: float) -> bool:
         """Whether it acts on a photograph of a heliostat, some days before now."""
@@ -108,12 +111,19 @@ FAULTS = (
     Fault("soiled", ("R03-05",), (11, 0), 0.45, "dimmed"),
     Fault("drives stepped", ("R04-09",), (9, 0), 9.0, "moved"),
     Fault("facet canted", ("R04-12",), (11, 0), 6.0, "fell"),
-    Fault("hazy", (), (20, 14), 0.35, None),
+    Fault("hazy", (), (20, 14), 0.35),
     Fault("clock", ("R02-03", "R02-08", "R04-03", "R03-13"), (4, 0), 1.0, "sun_contradicts_time"),
     Fault("time unknown", ("R03-11",), (99, 0), 0.0, "times_unknown"),
     Fault("not photographed", ("R02-06",), (34, 0), 0.0, "no_photograph"),
+    Fault("off target", ("R01-03",), (14, 0), 1.0, refusal="no_spot"),
+    Fault("foreign light", ("R01-07",), (14, 0), 1.0, refusal="second_spot"),
 )
 """All faults of the field; a test finds each."""
+
+
+def faulty_heliostats() -> set[str]:
+    """Names of the heliostats whose faults raise alarms."""
+    return {name for fault in FAULTS if fault.alarm for name in fault.heliostats}
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +166,7 @@ def write_layout(root: Path, rows: int = ROWS) -> Plant:
 def plan_photographs(plant: Plant, now: datetime, seed: int = 7) -> list[PlannedPhotograph]:
     """Choose times of all heliostats' photographs, in their order, with the faults of each."""
     rng = np.random.default_rng(seed)
-    often = {name for fault in FAULTS for name in fault.heliostats}
+    often = faulty_heliostats()
     photographs: list[PlannedPhotograph] = []
     midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
     for name, mirror in plant.heliostats.items():
@@ -181,6 +191,20 @@ def plan_photographs(plant: Plant, now: datetime, seed: int = 7) -> list[Planned
 
 def _true_mirror(prior: SurfacePrior, rng: np.random.Generator) -> Array:
     return prior.surface(rng.normal(0, DEVIATION, len(prior.basis)))
+
+
+def write_measured_surfaces(
+    root: Path, photographs: Sequence[PlannedPhotograph], seed: int = 8
+) -> None:
+    """Write the mirrors of photographs as deflectometry measures them, to some hundredths of a mm.
+
+    Every second heliostat has one, without those with an alarm.
+    """
+    rng = np.random.default_rng(seed)
+    mirrors = {one.mirror.name: one for one in photographs}
+    for name in sorted(set(mirrors) - faulty_heliostats())[1::2]:
+        z = mirrors[name].z
+        write_surface(root, mirrors[name].mirror, z + rng.normal(0, 5e-5, z.shape))
 
 
 def write_photographs(
@@ -224,8 +248,10 @@ def _photographed(
     with torch.no_grad():
         irradiance = align(setups, model).images(View(*_PIXELS, samples=12)).clamp(min=0).numpy()
     for one, rng, angle, light in zip(photographs, rngs, angles, irradiance, strict=True):
-        lost = (1 - one.faults.get("soiled", 0.0)) * (1 - one.faults.get("hazy", 0.0))
-        yield one, _draw(lost * light, rng), one.mirror.mount.motors_from_angles(angle)
+        for kind in ("soiled", "hazy", "off target"):
+            light *= 1 - one.faults.get(kind, 0.0)
+        light += one.faults.get("foreign light", 0.0) * np.roll(light, (-15, 24), (0, 1))
+        yield one, _draw(light, rng), one.mirror.mount.motors_from_angles(angle)
 
 
 def _step(one: PlannedPhotograph) -> float:

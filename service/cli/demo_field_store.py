@@ -14,8 +14,10 @@ from service.cli.demo_field import (
     ARCHIVED_DAYS,
     FAULTS,
     ROWS,
+    faulty_heliostats,
     plan_photographs,
     write_layout,
+    write_measured_surfaces,
     write_photographs,
 )
 from service.jobs.enqueuing import enqueue
@@ -30,7 +32,8 @@ ACTOR = "demo"
 """Who the store says made its jobs and sent its photographs."""
 
 _THREADS = 2
-_EVERY = 4  # of the heliostats without a fault, every fourth has a surface
+_EVERY = 4  # of the heliostats without an alarm, every fourth has a predicted surface
+_LIMIT_W_M2 = 4e5  # of the receiver
 
 
 def seed_field(
@@ -57,13 +60,14 @@ def seed_field(
     try:
         runtime.database.upgrade()
         import_folder(runtime, read_folder(root, [], whole_field=True), actor=ACTOR)
+        write_measured_surfaces(root, older)
         write_photographs(root, plant, older, progress)
         names = sorted({one.mirror.name for one in older})
         _in_threads(
             lambda part: import_folder(runtime, read_folder(root, part), progress, ACTOR), names
         )
-        faulty = {name for fault in FAULTS for name in fault.heliostats}
-        chosen = [name for place, name in enumerate(names) if name in faulty or not place % _EVERY]
+        others = sorted(set(names) - faulty_heliostats())
+        chosen = sorted(faulty_heliostats() | set(others[::_EVERY]))
         _in_threads(lambda part: _run(runtime, "predictions", heliostats=part, images=8), chosen)
         _run(runtime, "calibrations")
         write_photographs(root, plant, newer, progress)
@@ -73,9 +77,28 @@ def seed_field(
             lambda part: _receive(runtime, folder, part, sent, progress),
             list(folder.plant.heliostats),
         )
+        _do_work(runtime, now)
     finally:
         runtime.close()
     begun.rename(store)
+
+
+def _do_work(runtime: Runtime, now: datetime) -> None:
+    """Predict some surfaces again, study the hazy days, and plan the day."""
+    midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
+    names = sorted(faulty_heliostats())
+    _run(runtime, "predictions", heliostats=names[:4])
+    first, last = next(fault.days for fault in FAULTS if fault.kind == "hazy")
+    days = {"since": midnight - timedelta(days=first), "until": midnight - timedelta(days=last)}
+    candidates = ["sun_shape", "slope_error", "camera_blur"]
+    _run(runtime, "studies", heliostats=names, images=8, candidates=candidates, **days)
+    noon = midnight + timedelta(hours=12)
+    receiver = {"target": "main", "dni_w_m2": "clear_sky"}
+    _run(runtime, "forecasts", sun={"at": noon}, resolution=(64, 64), **receiver)
+    hours = {"first_at": noon - timedelta(hours=2), "last_at": noon + timedelta(hours=2)}
+    plan = {"name": "all to the middle", "step_minutes": 120, "allowed_w_m2": _LIMIT_W_M2}
+    _run(runtime, "plans", resolution=(32, 32), **hours, **plan, **receiver)
+    _run(runtime, "aim-plans", sun={"at": noon}, limit_w_m2=_LIMIT_W_M2, **receiver)
 
 
 def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> None:
@@ -85,9 +108,9 @@ def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> No
         list(pool.map(work, filter(None, parts)))
 
 
-def _run(runtime: Runtime, name: str, **payload: Any) -> None:
+def _run(runtime: Runtime, job: str, **payload: Any) -> None:
     """Queue a job, and run it."""
-    kind = KINDS[name]
+    kind = KINDS[job]
     enqueue(runtime, kind, kind.payload.model_validate(payload), ACTOR)
     Worker(runtime, KINDS, ACTOR, threading.Event()).work()
 

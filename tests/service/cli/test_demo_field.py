@@ -63,6 +63,29 @@ def test_a_hazy_week_is_seen_in_all_accuracies_and_then_gone(client: TestClient)
     assert during < min(before, after) - 0.03
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [f for f in FAULTS if f.refusal], ids=lambda fault: fault.kind)
+def test_faults_of_photographs_refuse_them(client: TestClient, fault: Fault):
+    for name in fault.heliostats:
+        items = client.get(f"/v1/heliostats/{name}/measurements").json()["items"]
+        assert fault.refusal in {one["reason"] for one in items}
+
+
+@pytest.mark.slow
+def test_a_study_of_the_hazy_days_finds_wider_light(client: TestClient):
+    (study,) = client.get("/v1/studies").json()["items"]
+    assert study["verdict"] == "effect"
+    (found,) = client.get(f"/v1/studies/{study['id']}").json()["effects"]
+    assert found["name"] in ("sun_shape", "slope_error", "camera_blur")
+
+
+@pytest.mark.slow
+def test_all_jobs_are_done(client: TestClient):
+    jobs = client.get("/v1/jobs").json()["items"]
+    assert {one["state"] for one in jobs} == {"done"}
+    assert {one["kind"] for one in jobs} >= {"predictions", "calibrations", "studies", "aim-plans"}
+
+
 def test_a_store_that_exists_stays(tmp_path: Path):
     (tmp_path / "data").mkdir()
     seed_field(tmp_path / "plant", tmp_path / "data")
