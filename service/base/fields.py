@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from datetime import UTC, date, datetime
 from itertools import islice
 from typing import Annotated, Any, Literal, Self, TypeVar
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from pydantic import (
@@ -126,8 +127,33 @@ def parse_moment(moment: datetime) -> datetime:
 
 Moment = Annotated[AwareDatetime, AfterValidator(parse_moment)]
 
-FormMoment = Annotated[datetime, AfterValidator(parse_moment)]
-"""Times in forms. A browser's date field has no time zone; the pages state that it is UTC."""
+
+def _read_form_time(text: Any) -> Any:
+    if isinstance(text, datetime):
+        return text
+    try:
+        moment = datetime.fromisoformat(str(text).strip())
+    except ValueError as error:
+        raise ValueError(
+            "give a date and a time as 2026-06-21 13:00, in the plant's time zone"
+        ) from error
+    parse_moment(moment)
+    return moment
+
+
+FormMoment = Annotated[datetime, BeforeValidator(_read_form_time)]
+"""Times in forms: ``2026-06-21 13:00``, in the plant's time zone unless an offset follows.
+
+Forms do not know the zone; see `Model.in_utc`.
+"""
+
+
+def plant_time_to_utc(moment: datetime, zone: str) -> datetime:
+    """A time of a form in UTC. Without an offset it is in ``zone``, which is the plant's."""
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=ZoneInfo(zone))
+    return moment.astimezone(UTC)
+
 
 # Fields of responses.
 Id = Annotated[int, Field(description="Number of the entry, from 1; paths name it by this.")]
@@ -198,6 +224,15 @@ class Model(BaseModel):
     """Base class of requests: finite numbers, no unknown keys."""
 
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid", frozen=True)
+
+    def in_utc(self, zone: str) -> Self:
+        """The same form with its times in UTC; see `plant_time_to_utc`."""
+        times = {
+            name: plant_time_to_utc(value, zone)
+            for name, value in self
+            if isinstance(value, datetime)
+        }
+        return self.model_copy(update=times)
 
     @model_validator(mode="wrap")
     @classmethod

@@ -47,14 +47,25 @@ def percent(value: float | None, digits: int = 1) -> Quantity:
     return figure(None if value is None else value * 100, digits, "%")
 
 
-def moment(value: datetime | None) -> str | Markup:
-    """A time in UTC; a dash if it is unknown, which includes 1970 and before."""
+def moment(value: datetime | None, zone: str = "UTC") -> str | Markup:
+    """A time in a ``zone``; a dash if it is unknown, which includes 1970 and before."""
     if value is None or value.year <= 1970:
         return "–"
-    utc = value.astimezone(UTC)
     return Markup('<time datetime="{}">{}</time>').format(
-        format_time(utc), utc.strftime("%Y-%m-%d %H:%M UTC")
+        format_time(value.astimezone(UTC)), in_zone(zone)(value)
     )
+
+
+def form_time(value: datetime | None, zone: str = "UTC") -> str:
+    """A time in a ``zone`` for a form's field, to the second if it has seconds.
+
+    The second of two equal times, when clocks are set back, has its offset.
+    """
+    if value is None:
+        return ""
+    local = value.astimezone(ZoneInfo(zone))
+    seconds = f":{local:%S}" if local.second else ""
+    return f"{local:%Y-%m-%d %H:%M}{seconds}{f'{local:%z}' if local.fold else ''}"
 
 
 def in_zone(zone: str | None) -> Callable[[datetime], str]:
@@ -133,6 +144,7 @@ def environment(*packages: str) -> Environment:
         figure=figure,
         percent=percent,
         moment=moment,
+        form_time=form_time,
         power=power,
         irradiance=irradiance,
         lasting=lasting,

@@ -41,6 +41,10 @@ _WEATHER = tuple(weather.name for weather in fields(Weather))
 _MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m", "arrays")
 
 
+class NothingToChangeError(ConflictError):
+    """A photograph has the values of its correction already."""
+
+
 @dataclass(frozen=True)
 class PhotographChanges:
     """Corrected metadata of a photograph; None leaves a value unchanged.
@@ -80,8 +84,10 @@ def correct_photograph(
     ------
     NotFoundError
         If heliostat, measurement or target are not stored.
+    NothingToChangeError
+        If nothing would change.
     ConflictError
-        If nothing would change, or another image of the photograph came meanwhile.
+        If another image of the photograph came meanwhile.
     GoneError
         If an image must be re-measured, but is deleted.
     """
@@ -89,7 +95,7 @@ def correct_photograph(
     with runtime.database.writing() as session:
         row, change = apply_correction(session, prepared, actor)
         if change is Change.UNCHANGED:
-            raise ConflictError(
+            raise NothingToChangeError(
                 f"measurement {identifier} has these values already; nothing changed"
             )
     return row

@@ -6,7 +6,8 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 
 from model.errors import InvalidInputError
-from service.base.fields import FormMoment
+from service.base.fields import FormMoment, plant_time_to_utc
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.pointing.calibration import make_plan
 from service.web.auth.dependencies import COMPUTE_SLOT, READ, RuntimeDep
 from service.web.responses.pages import render
@@ -23,6 +24,9 @@ def get_plan_page(
     photographs: Annotated[int, Query(ge=1, le=60)] = 12,
 ) -> HTMLResponse:
     """The next photographs, from now or from another time. The page says so at night."""
+    if at is not None:
+        with runtime.database.reading() as session:
+            at = plant_time_to_utc(at, plant_time_zone(session, runtime.settings.time_zone))
     try:
         slots, trouble = make_plan(runtime, at, minutes, photographs), None
     except InvalidInputError as error:

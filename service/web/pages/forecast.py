@@ -1,10 +1,13 @@
 """Pages of forecasts: a form, and the resulting flux map."""
 
+import re
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Annotated, Literal, Self
+from zoneinfo import ZoneInfo
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
 from pydantic import Field, ValidationError, model_validator
 from sqlalchemy import select
@@ -18,16 +21,18 @@ from service.base.fields import (
     AZIMUTH,
     ELEVATION,
     FormMoment,
+    Lines,
     Model,
     Name,
     Search,
     Sun,
     SunAt,
     Version,
+    plant_time_to_utc,
 )
+from service.base.names import NAME
 from service.base.validation_messages import format_validation_error
 from service.drawing import charts
-from service.drawing.templates import in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -35,6 +40,7 @@ from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import (
     ForecastRequest,
     flux_of,
@@ -76,9 +82,12 @@ class Made:
 
 
 class ForecastForm(Model):
-    """The form. Without a heliostat, it requests a forecast of all heliostats."""
+    """The form. ``heliostat`` has one name or several, apart by commas or blanks.
 
-    heliostat: Name | None = None
+    Without a name, it requests a forecast of all heliostats.
+    """
+
+    heliostat: Lines = ""
     target: Name
     sun_by: Literal["position", "time"] = "position"
     azimuth_deg: Annotated[float, AZIMUTH] | None = None
@@ -90,6 +99,12 @@ class ForecastForm(Model):
 
     @model_validator(mode="after")
     def _says_when_or_where(self) -> Self:
+        wrong = next((name for name in self.names if not re.fullmatch(NAME, name)), None)
+        if wrong is not None:
+            raise ValueError(
+                f"heliostat: {wrong!r} is no name; give names of 1 to 32 letters, digits,"
+                " underscores and hyphens, apart by commas"
+            )
         if self.sun_by == "time" and self.moment is None:
             raise ValueError("moment: say when")
         if self.sun_by == "position" and self.moment is not None:
@@ -100,6 +115,11 @@ class ForecastForm(Model):
         if self.sun_by == "position" and (self.azimuth_deg is None or self.elevation_deg is None):
             raise ValueError("azimuth_deg, elevation_deg: give the position of the sun")
         return self
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the heliostats, each once."""
+        return list(dict.fromkeys(self.heliostat.replace(",", " ").split()))
 
     @property
     def given_dni(self) -> float | Literal["clear_sky"]:
@@ -115,6 +135,21 @@ class ForecastForm(Model):
         assert self.azimuth_deg is not None
         assert self.elevation_deg is not None
         return Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg)
+
+
+When = Literal["now", "noon"]
+
+WHENS: dict[When, str] = {"now": "Now", "noon": "Noon tomorrow"}
+"""Times that forms offer, with their labels."""
+
+
+def time_of(when: When, zone: str) -> datetime:
+    """Now, or noon of the next day in a time ``zone``; without seconds, in UTC."""
+    at = now().replace(second=0, microsecond=0)
+    if when == "now":
+        return at
+    tomorrow = at.astimezone(ZoneInfo(zone)).replace(tzinfo=None) + timedelta(days=1)
+    return plant_time_to_utc(tomorrow.replace(hour=12, minute=0), zone)
 
 
 def sun_now(plant: PlantRow | None) -> tuple[float, float]:
@@ -183,8 +218,10 @@ def get_offered_heliostats(
 def get_forecast_form(
     request: Request,
     runtime: RuntimeDep,
-    heliostat: Annotated[Name | None, Query()] = None,
+    heliostat: Annotated[Lines, Query(max_length=2000)] = "",
     job: Annotated[Version | None, Query()] = None,
+    target: Annotated[Name | None, Query()] = None,
+    when: Annotated[When | None, Query(description="A time to fill in.")] = None,
 ) -> HTMLResponse:
     """The form with defaults, or with the values of a forecast ``job``."""
     with runtime.database.reading() as session:
@@ -193,9 +230,15 @@ def get_forecast_form(
             filled = _filled_as(session, queue.get_job(session, job))
             return _page(request, runtime, choices, filled, forecast=None)
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
+        zone = plant_time_zone(session, runtime.settings.time_zone)
         name = heliostat or next((row.name for row in store.list_heliostats(session, 1)), "")
     filled = ForecastForm.model_construct(
-        heliostat=name, target="", azimuth_deg=azimuth, elevation_deg=elevation
+        heliostat=name,
+        target=target or "",
+        azimuth_deg=azimuth,
+        elevation_deg=elevation,
+        sun_by="position" if when is None else "time",
+        moment=None if when is None else time_of(when, zone),
     )
     return _page(request, runtime, choices, filled, forecast=None)
 
@@ -213,7 +256,7 @@ def _filled_as(session: Session, job: JobRow) -> ForecastForm:
     moment = asked.sun.at if isinstance(asked.sun, SunAt) else None
     sun = position_of(session, asked.sun)
     return ForecastForm.model_construct(
-        heliostat="",
+        heliostat=", ".join(asked.heliostats or ()),
         target=asked.target or "",
         azimuth_deg=round(sun.azimuth_deg, 3) % 360,
         elevation_deg=round(sun.elevation_deg, 3),
@@ -232,19 +275,24 @@ def _page(
     filled: ForecastForm,
     **shown: object,
 ) -> HTMLResponse:
-    zone = runtime.settings.time_zone
-    context = {**choices, **shown, "filled": filled, "zone": zone, "in_zone": in_zone(zone)}
-    return render(request, "forecast.html", **context)
+    return render(request, "forecast.html", **choices, **shown, filled=filled, whens=WHENS)
 
 
-def _ask_for_all(runtime: Runtime, form: ForecastForm, identity: Identity) -> str:
-    """Enqueue a forecast of all heliostats, and return the path of its job.
+def _ask_for_many(runtime: Runtime, form: ForecastForm, identity: Identity) -> str:
+    """Enqueue a forecast of several or all heliostats, and return the path of its job.
 
     It takes longer than a request may.
     """
-    payload = FleetForecastIn(
-        target=form.target, sun=form.sun, surface=form.surface, dni_w_m2=form.given_dni
-    )
+    try:
+        payload = FleetForecastIn(
+            heliostats=form.names or None,
+            target=form.target,
+            sun=form.sun,
+            surface=form.surface,
+            dni_w_m2=form.given_dni,
+        )
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error
     row = enqueue(runtime, field_forecasts.KIND, payload, identity.name)
     return f"/jobs/{row.id}"
 
@@ -258,11 +306,12 @@ def post_forecast_form(
 ) -> Response:
     """Compute and store a forecast, and go to its page."""
     with runtime.database.reading() as session:
+        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
         sun, altitude = position_of(session, form.sun), store.get_plant(session).altitude_m
-    if form.heliostat is None:
-        return leave_for(request, _ask_for_all(runtime, form, identity))
+    if len(form.names) != 1:
+        return leave_for(request, _ask_for_many(runtime, form, identity))
     asked = ForecastRequest(
-        heliostat=form.heliostat,
+        heliostat=form.names[0],
         target=form.target,
         sun=sun,
         sun_at=form.moment if form.sun_by == "time" else None,

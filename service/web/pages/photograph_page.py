@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from fastapi import APIRouter, Form, Header, Request, Response
+from fastapi import APIRouter, Form, Header, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from sqlalchemy import select
 
@@ -18,7 +18,12 @@ from service.drawing.templates import in_words
 from service.store.photographs.correction_log import list_corrections, made_from
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
 from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
-from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.photographs.corrections import (
+    NothingToChangeError,
+    PhotographChanges,
+    correct_photograph,
+)
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.photographs.display import compare_one, load_for_display, pixels_of
 from service.twin.runtime.runtime import Runtime
@@ -43,6 +48,10 @@ router = APIRouter(include_in_schema=False)
 PATH = "/heliostats/{name}/photographs/{measurement}"
 
 
+DIGITS = 4
+"""Decimals of the sun's angles in the form [deg]."""
+
+
 class CorrectionForm(Model):
     """The correction form, which is filled with the stored values."""
 
@@ -53,6 +62,17 @@ class CorrectionForm(Model):
     taken_at: FormMoment | None = None
     excluded: bool = False
     predict_again: bool = False
+
+    def without_rounding(self, row: MeasurementRow) -> Self:
+        """The form with the stored values where it has them as the page rounds them."""
+        taken_at = row.taken_at
+        shown = {
+            "azimuth_deg": (round(row.sun_azimuth_deg, DIGITS), row.sun_azimuth_deg),
+            "elevation_deg": (round(row.sun_elevation_deg, DIGITS), row.sun_elevation_deg),
+            "taken_at": (taken_at and taken_at.replace(microsecond=0), taken_at),
+        }
+        same = {name: full for name, (short, full) in shown.items() if getattr(self, name) == short}
+        return self.model_copy(update=same)
 
     @property
     def sun(self) -> Sun | None:
@@ -152,7 +172,11 @@ def get_view(
 
 @router.get(PATH, dependencies=[READ, COMPUTE_SLOT])
 def get_photograph_page(
-    name: NamePath, measurement: MeasurementPath, request: Request, runtime: RuntimeDep
+    name: NamePath,
+    measurement: MeasurementPath,
+    request: Request,
+    runtime: RuntimeDep,
+    unchanged: Annotated[bool, Query(description="Say that a correction changed nothing.")] = False,
 ) -> HTMLResponse:
     """A photograph with its flux, the forecast of the current twin, and its history."""
     with runtime.database.reading() as session:
@@ -175,6 +199,7 @@ def get_photograph_page(
         kept={kind: image for kind, image in images.items() if image.has_file},
         comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
         trouble=trouble,
+        unchanged=unchanged,
         is_excluded=row.reason == EXCLUDED,
         corrections=[(row, change_texts(row)) for row in corrections],
         made=made,
@@ -190,10 +215,14 @@ def post_correction_form(
     runtime: RuntimeDep,
     identity: IdentityDep,
 ) -> Response:
-    """Correct or exclude a photograph.
+    """Correct or exclude a photograph. Without a change, its page says so.
 
     Return to its page, or to the job that predicts the surface again.
     """
+    with runtime.database.reading() as session:
+        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+        form = form.without_rounding(row)
     changes = PhotographChanges(
         reason=form.reason,
         target_name=form.target,
@@ -201,7 +230,10 @@ def post_correction_form(
         taken_at=form.taken_at,
         excluded=form.excluded,
     )
-    correct_photograph(runtime, name, measurement, changes, identity.name)
+    try:
+        correct_photograph(runtime, name, measurement, changes, identity.name)
+    except NothingToChangeError:
+        return go_to(f"/heliostats/{name}/photographs/{measurement}?unchanged=true")
     if form.predict_again:
         return go_to(f"/jobs/{predict_again(runtime, name, identity.name)}")
     return go_to(f"/heliostats/{name}/photographs/{measurement}")

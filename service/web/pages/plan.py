@@ -6,6 +6,7 @@ A plan compares the twin with ideal mirrors, and with the flux that the receiver
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Annotated, Literal
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -18,7 +19,7 @@ from model.errors import InvalidInputError
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
-from service.base.fields import FormMoment, Lines, Model, Name, Version
+from service.base.fields import FormMoment, Lines, Model, Name, Version, plant_time_to_utc
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_zone
@@ -34,6 +35,7 @@ from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
+from service.web.pages.forecast import WHENS, When, time_of
 from service.web.pages.plan_aims import aims_for, plan_with
 from service.web.responses.pages import go_to, leave_for, render
 
@@ -119,15 +121,22 @@ class PlanForm(Model):
             raise RequestValidationError(error.errors()) from error
 
 
-def _likely(targets: list[str], name: str) -> PlanForm:
-    """Defaults of the form: a day from morning to evening."""
-    morning = now().replace(hour=6, minute=0, second=0, microsecond=0)
+def _likely(targets: list[str], name: str, zone: str) -> PlanForm:
+    """Defaults of the form: a day from morning to evening at the plant."""
+    today = now().astimezone(ZoneInfo(zone)).replace(tzinfo=None)
+    morning = plant_time_to_utc(today.replace(hour=6, minute=0, second=0, microsecond=0), zone)
     return PlanForm.model_construct(
         name=name,
         target=next(iter(targets), ""),
         first_at=morning,
         last_at=morning + timedelta(hours=12),
     )
+
+
+def _at(form: object, at: datetime) -> PlanForm:
+    """The form for a single time."""
+    assert isinstance(form, PlanForm)
+    return form.model_copy(update={"first_at": at, "last_at": at})
 
 
 def _filled(asked: PlanIn) -> PlanForm:
@@ -307,8 +316,10 @@ def _context(
     targets = [*receivers, *(row.name for row in store.list_targets(session))]
     plans = store.list_plans(session, LISTED + 1, after)
     return {
-        "filled": _likely(targets, name) if asked is None else _filled(asked),
-        "in_zone": in_zone(None if zone == "UTC" else zone),
+        "filled": _likely(targets, name, zone) if asked is None else _filled(asked),
+        "in_zone": in_zone(zone),
+        "zone": zone,
+        "whens": WHENS,
         "plan_days": runtime.settings.plan_retention_days,
         "targets": targets,
         "plans": plans[:LISTED],
@@ -327,11 +338,14 @@ def get_plans_page(
     runtime: RuntimeDep,
     after: After = None,
     aims: Annotated[Version | None, Query(description="Job of an aim plan to fill in.")] = None,
+    when: Annotated[When | None, Query(description="A time to fill in.")] = None,
 ) -> HTMLResponse:
     """The form, and the list of plans."""
     with runtime.database.reading() as session:
         asked = None if aims is None else plan_with(session, aims)
         context = _context(runtime, session, after, asked)
+        if when is not None:
+            context["filled"] = _at(context["filled"], time_of(when, str(context["zone"])))
     return render(request, "plan.html", **context, job=None, day=None)
 
 
@@ -379,6 +393,8 @@ def post_plan_form(
 
     Errors are shown next to the form, which keeps its values.
     """
+    with runtime.database.reading() as session:
+        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
     payload = form.payload()
     row = enqueue(runtime, plans.KIND, payload, identity.name)
     return leave_for(request, f"/plans/{row.id}")
@@ -392,7 +408,7 @@ def post_aims_form(
     with runtime.database.reading() as session:
         zone = plant_time_zone(session, runtime.settings.time_zone)
     try:
-        payload = aims_for(form.payload(), zone, form.limit_map())
+        payload = aims_for(form.in_utc(zone).payload(), zone, form.limit_map())
     except ValidationError as error:
         raise RequestValidationError(error.errors()) from error
     if payload is None:

@@ -22,7 +22,8 @@ from starlette.types import Scope
 from service.base.arrays import pack
 from service.base.errors import NotFoundError
 from service.drawing.charts import Figure
-from service.drawing.templates import ASSETS, environment, moment
+from service.drawing.templates import ASSETS, environment, form_time, moment
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.security import Identity, Role
 from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
 from service.web.responses.fragments import Part
@@ -68,9 +69,13 @@ def asset(name: str) -> str:
 
 @dataclass
 class _Rendering:
-    """State of a page while it is rendered: its path, and its figures and tables by name."""
+    """State of a page while it is rendered.
+
+    Its path, the plant's time zone, and its figures and tables by name.
+    """
 
     page: str
+    zone: str = "UTC"
     figures: dict[str, Figure] = field(default_factory=dict)
     tables: dict[str, PageTable] = field(default_factory=dict)
 
@@ -94,13 +99,22 @@ def _add_cell(*cell: Any) -> Column:
     return next(reversed(_RENDERING.get().tables.values())).add(*cell)
 
 
+def _zone() -> str:
+    return _RENDERING.get().zone
+
+
+def _moment(value: datetime | None) -> str | Markup:
+    """A time in the plant's time zone."""
+    return moment(value, _zone())
+
+
 def _shown(value: Any) -> str:
     """The value of a table's cell as text of the page."""
     match value:
         case list():
             return Markup("").join(map(_shown, value))
         case datetime() | None:
-            return moment(value)
+            return _moment(value)
     return str(value)
 
 
@@ -122,7 +136,10 @@ def _environment() -> Environment:
     made.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
     made.globals.update(link_to_table=_link_to_table, link_to_figure=_link_to_figure)
     made.globals.update(new_table=_new_table, add_cell=_add_cell, has_guide=has_guide)
-    made.filters.update(shown=_shown)
+    made.globals.update(plant_zone=_zone)
+    made.filters.update(
+        shown=_shown, moment=_moment, form_time=lambda value: form_time(value, _zone())
+    )
     return made
 
 
@@ -136,7 +153,9 @@ def count_badge(number: int) -> Markup:
     return Markup(badge).format(number) if number else Markup("")
 
 
-def _text(scope: Scope, template: str, context: dict[str, object]) -> tuple[str, _Rendering]:
+def _text(
+    scope: Scope, template: str, context: dict[str, object], zone: str = "UTC"
+) -> tuple[str, _Rendering]:
     identity: Identity | None = scope.get("state", {}).get("identity")
     may: dict[str, object] = {
         f"may_{role}": identity is not None and identity.role.includes(role)
@@ -145,7 +164,7 @@ def _text(scope: Scope, template: str, context: dict[str, object]) -> tuple[str,
     counted = getattr(getattr(scope.get("app"), "state", None), "attention", None)
     may["alarm_count"] = count_badge(0 if counted is None else counted.last)
     path, query = scope.get("path", ""), scope.get("query_string", b"").decode("ascii", "replace")
-    rendering = _Rendering(quote(path) + (f"?{query}" if query else ""))
+    rendering = _Rendering(quote(path) + (f"?{query}" if query else ""), zone)
     token = _RENDERING.set(rendering)
     try:
         text = TEMPLATES.get_template(template).render(context, identity=identity, here=path, **may)
@@ -163,7 +182,10 @@ def render(request: Request, template: str, /, **context: object) -> HTMLRespons
         If the page has no such part.
     """
     part: Part | None = request.scope.get("state", {}).get("part")
-    text, rendering = _text(request.scope, template, context)
+    runtime = request.app.state.runtime
+    with runtime.database.reading() as session:
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+    text, rendering = _text(request.scope, template, context, zone)
     if part is None:
         return HTMLResponse(text)
     name = "-".join(filter(None, [*request.scope["path"].split("/"), part.table or part.figure]))

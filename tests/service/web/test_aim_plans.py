@@ -214,7 +214,9 @@ def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
         assert words in aims.words
     (link,) = (a["href"] for a in aims.all("a") if a.words == "Plan the day with these aims")
     again = Page(plant.get(link, headers={"Accept": "text/html"}).text)
-    filled = {field["name"]: field.attributes.get("value", "") for field in again.all("input")}
+    filled = {
+        field["name"]: field.attributes.get("value", "") for field in again.one("main").all("input")
+    }
     kept = sent(plant, "/plans", form | {name: filled[name] for name in ("name", "aim_plan")})
     assert "kept at all times" in kept.words
 

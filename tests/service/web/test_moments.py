@@ -1,0 +1,118 @@
+"""Forms: times in the plant's time zone, several heliostats, and corrections without a change."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.base.fields import plant_time_to_utc
+from service.base.settings import Settings
+from service.drawing.templates import form_time
+from service.store.columns import now
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    tower_document,
+)
+from tests.service.web.pages import HTML, field_of, form, text_of
+
+ZONE = "Europe/Madrid"
+
+
+@pytest.fixture(scope="module")
+def madrid(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    settings = Settings(data_dir=tmp_path_factory.mktemp("madrid"), time_zone=ZONE, **QUIET)
+    with client_of(create_app(settings, FakeOperations())) as client:
+        assert client.put("/v1/plant", json=tower_document()).status_code == 200
+        for place, name in enumerate(("AA39", "AB01", "AC02")):
+            properties = properties_document()
+            properties["heliostat_position"][0] += 3e-4 * place
+            assert client.put(f"/v1/heliostats/{name}", json=properties).status_code == 201
+        sun = {"azimuth_deg": 201.2345678912, "elevation_deg": 45.9876543211}
+        answer = poster(client)(
+            png(1), id="101", sun=sun, taken_at="2024-05-01T10:00:00.250Z", heliostat="AA39"
+        )
+        assert answer.status_code == 201, answer.text
+        client.headers.update(HTML)
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("text", "utc"),
+    [
+        ("2026-06-21 13:00", "2026-06-21T11:00"),
+        ("2026-06-21T13:00:05", "2026-06-21T11:00:05"),
+        ("2026-01-21 13:00", "2026-01-21T12:00"),
+        ("2026-10-25 02:30", "2026-10-25T00:30"),  # the first of two equal times
+        ("2026-10-25 02:30+0100", "2026-10-25T01:30"),
+    ],
+)
+def test_times_of_forms_are_the_plants(text: str, utc: str):
+    at = plant_time_to_utc(datetime.fromisoformat(text), ZONE)
+    assert at == datetime.fromisoformat(utc).replace(tzinfo=UTC)
+    assert form_time(at, ZONE) == text.replace("T", " ")
+
+
+def test_wrong_time_names_the_field_and_the_remedy(madrid: TestClient):
+    answer = madrid.post("/forecast", data=form(sun_by="time", moment="06/21/2026 1 pm"))
+    assert answer.status_code == 422
+    assert "moment: give a date and a time as 2026-06-21 13:00, in the plant" in answer.text
+
+
+@pytest.mark.parametrize("path", ["/forecast", "/plans", "/calibration-plan"])
+def test_forms_say_the_zone(madrid: TestClient, path: str):
+    page = text_of(madrid, path)
+    assert ZONE in page.one("main").words
+    assert not page.all("input", type="datetime-local")
+
+
+def test_now_and_noon_tomorrow_are_filled_in(madrid: TestClient):
+    here = datetime.fromisoformat(form_time(now(), ZONE))
+    page = text_of(madrid, "/forecast?when=now&heliostat=AB01&target=upper")
+    (first, second) = [link["href"] for link in page.all("a") if "when=" in link["href"]]
+    assert abs(datetime.fromisoformat(field_of(page, "moment")) - here) < timedelta(minutes=2)
+    assert page.one("input", name="sun_by", value="time").attributes.keys() >= {"checked"}
+    assert (field_of(page, "heliostat"), "target=upper" in first) == ("AB01", True)
+    noon = f"{here + timedelta(days=1):%Y-%m-%d} 12:00"
+    assert field_of(text_of(madrid, second), "moment") == noon
+    plan = text_of(madrid, "/plans?when=noon")
+    assert field_of(plan, "first_at") == field_of(plan, "last_at") == noon
+
+
+def test_several_heliostats_are_forecast_together(madrid: TestClient):
+    asked = form(heliostat="AB01, AA39 AB01")
+    path = madrid.post("/forecast", data=asked, follow_redirects=False).headers["Location"]
+    job: Any = madrid.get(f"/v1{path}").json()
+    assert job["payload"]["heliostats"] == ["AB01", "AA39"]
+    again = text_of(madrid, f"/forecast?job={job['id']}")
+    assert field_of(again, "heliostat") == "AB01, AA39"
+    wrong = madrid.post("/forecast", data=form(heliostat="AA39, x/y"))
+    assert wrong.status_code == 422
+    assert "is no name" in wrong.text
+
+
+def test_correction_without_a_change_returns_to_the_page(madrid: TestClient):
+    path = "/heliostats/AA39/photographs/101"
+    page = text_of(madrid, path)
+    names = ("azimuth_deg", "elevation_deg", "taken_at")
+    asked = {name: field_of(page, name) for name in names}
+    assert asked == {
+        "azimuth_deg": "201.2346",
+        "elevation_deg": "45.9877",
+        "taken_at": "2024-05-01 12:00",
+    }
+    answer = madrid.post(path, data=asked | {"reason": "none"})
+    assert answer.status_code == 200
+    assert "Nothing was corrected" in answer.text
+    # One changed value changes no other one.
+    madrid.post(path, data=asked | {"reason": "typed wrong", "elevation_deg": "45.5"})
+    stored = madrid.get("/v1/heliostats/AA39/measurements/101").json()
+    assert stored["sun"] == {"azimuth_deg": 201.2345678912, "elevation_deg": 45.5}
+    assert stored["taken_at"].startswith("2024-05-01T10:00:00.25")
