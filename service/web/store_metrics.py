@@ -23,6 +23,7 @@ from service.store import sizes
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
+from service.twin.alerts.acknowledging import record_history
 from service.twin.alerts.alerts import Alert, list_alerts
 from service.twin.alerts.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alerts.reasons import REASONS
@@ -48,18 +49,18 @@ class StoreCollector(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Query the metrics in one transaction."""
+        """Query the metrics in one transaction, and record which alerts came and went."""
         try:
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
-                found.append(
-                    _attention(list_alerts(session, self._cache, self._runtime.settings)[0])
-                )
+                alerts = list_alerts(session, self._cache, self._runtime.settings)
+                found.append(_attention(alerts.alerts))
                 found.append(_cameras(self._cache.cameras.changes(session, self._runtime.settings)))
                 found += self._cache.recent(
                     session, "metrics", partial(self._of_heliostats, session)
                 )
                 found.append(_drift(session, self._runtime.settings.metrics_heliostats))
+            record_history(self._runtime, alerts)
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
             found = []

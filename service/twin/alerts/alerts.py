@@ -265,7 +265,8 @@ _GIVE_TIMES = (
 
 
 def _times_unknown(name: str, count: int, first: datetime) -> Alert:
-    message = f"the time of all {count} accepted photographs is unknown, and so is how old they are"
+    which = "its one accepted photograph" if count == 1 else f"all {count} accepted photographs"
+    message = f"the time of {which} is unknown, and so is the age"
     action = f"{_GIVE_TIMES}, and have taken_at sent with each photograph"
     return Alert("times_unknown", name, first, message, action, first.isoformat())
 

@@ -91,7 +91,7 @@ class AcknowledgementsIn(Model):
     ids: list[ItemId] = Field(
         min_length=1, max_length=500, description="Ids of items of `GET /v1/attention`."
     )
-    reason: fields.Reason
+    reason: Annotated[fields.Reason, Field(description="Why they are acknowledged.")]
 
 
 class AcknowledgementOut(BaseModel):
@@ -110,8 +110,10 @@ class AlertHistoryOut(BaseModel):
     """An alert from its beginning to its end."""
 
     id: Id
-    reason: Reason
-    severity: Severity
+    reason: Reason = Field(description="What kind of alert it is.")
+    severity: Severity = Field(
+        description="By the reason: 1 act now, 2 act today, 3 when there is time."
+    )
     heliostat: str | None = Field(description="null: the plant as a whole.")
     since: From
     message: str = Field(description="What was wrong, when it was first seen.")
@@ -223,7 +225,7 @@ def undo_acknowledgements(
 
 @router.get("/causes", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
 def list_attention_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonCauseOut]:
-    """List probable common causes of alerts that nobody acknowledged, the largest first."""
+    """List probable causes of open alerts, the one of most first."""
     with runtime.database.reading() as session:
         items, _ = list_alerts(session, cache, runtime.settings)
         causes = find_common_causes(session, items, runtime.settings)

@@ -93,6 +93,21 @@ class AttentionQuery(Model):
         return sorted(chosen, key=attrgetter("since"), reverse=self.sort == "newest")
 
 
+class HistoryQuery(Model):
+    """Filters of the history, and the record after which it begins."""
+
+    reason: Reason | None = None
+    heliostat: Name | None = None
+    after: Version | None = None
+
+    _filled = model_validator(mode="before")(drop_empty_fields)
+
+    def older(self, after: int) -> str:
+        """The URL of what is older than record ``after``."""
+        asked = self.model_dump(exclude_none=True) | {"after": after}
+        return f"/attention/history?{urlencode(asked)}"
+
+
 class AcknowledgementForm(Model):
     """The ticked alerts and groups, and why they are acknowledged."""
 
@@ -186,6 +201,7 @@ def post_acknowledgement_form(
         ids |= dict.fromkeys(alert.id for alert in groups[token])
     done = acknowledge(runtime, cache, list(ids), identity.name, form.comment)
     count.forget()
+    count.read()
     return go_to(query.link(done=done[0].acknowledgement))
 
 
@@ -200,18 +216,20 @@ def post_undo_form(
     """Undo an acknowledgement, and return to the page."""
     undo_acknowledgement(runtime, number, identity.name)
     count.forget()
+    count.read()
     return go_to("/attention" if page == "attention" else "/attention/history")
 
 
 @router.get("/attention/history", dependencies=[READ, OVERVIEW_SLOT])
 def get_attention_history_page(
     request: Request,
+    query: Annotated[HistoryQuery, Query()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    after: Annotated[Version | None, Query()] = None,
 ) -> HTMLResponse:
     """Acknowledgements with their reasons, and alerts that are or were present."""
-    rows = read_history(runtime, cache, _LISTED + 1, after)
+    wanted = AlertFilter(query.reason, heliostat=query.heliostat)
+    rows = read_history(runtime, cache, _LISTED + 1, query.after, wanted)
     with runtime.database.reading() as session:
         batches = acknowledgements.list_batches(session, _BATCHES)
     return render(
@@ -219,8 +237,8 @@ def get_attention_history_page(
         "attention_history.html",
         reasons=REASONS,
         severities=SEVERITIES,
-        batches=[] if after else batches,
+        query=query,
+        batches=[] if query.after else batches,
         rows=rows[:_LISTED],
-        older=rows[_LISTED - 1].row.id if len(rows) > _LISTED else None,
-        after=after,
+        older=query.older(rows[_LISTED - 1].row.id) if len(rows) > _LISTED else None,
     )
