@@ -9,14 +9,7 @@ import pytest
 
 from service.web.app import create_app
 from tests.service import real
-from tests.service.browser.browsing import (
-    DESK,
-    PHONE,
-    GatedOperations,
-    Served,
-    expect,
-    violations,
-)
+from tests.service.browser.browsing import DESK, PHONE, GatedOperations, Served, expect, violations
 from tests.service.browser.test_shift import AXE, TOO_WIDE
 from tests.service.conftest import free_port, serving
 from tests.service.twin.test_causes import add_photographs, lay_out, veil
@@ -91,7 +84,9 @@ def test_worst_heliostat_gets_a_promoted_surface_in_six_clicks(page: Any):
     expect(page.locator(worst)).to_be_visible()
     clicks.follow(worst)
     expect(page.locator("#causes-title")).to_have_text("Why is it bad")
-    expect(page.locator("ol.causes li").first).to_contain_text("2 photographs of 6 contradict the others")
+    expect(page.locator("ol.causes li").first).to_contain_text(
+        "2 photographs of 6 contradict the others"
+    )
     chosen = page.locator("[name=photographs]:checked")
     assert sorted(one.get_attribute("value") for one in chosen.all()) == sorted(VEILED)
     check(page)
