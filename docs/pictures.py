@@ -1,15 +1,19 @@
 """Draw the pictures of README and the site from a demonstration: ``python -m docs.pictures OUT``.
 
-``OUT`` is the folder of ``heliotwin demo``, ``out/demo`` by default. Chromium takes the page of a
-heliostat.
+``OUT`` is the folder of ``heliotwin demo``, ``out/demo`` by default. Chromium takes the pages.
 """
 
 import json
 import os
 import shutil
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from subprocess import PIPE, Popen, run
+from tempfile import TemporaryDirectory
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -108,24 +112,48 @@ def draw_second_plant(out: Path) -> None:
     for name in ("plant", "field"):
         shutil.copyfile(out / f"{name}.png", PICTURE.with_name(f"second-{name}.png"))
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    address = f"http://127.0.0.1:{PORT}"
+    name = report["heliostats"][0]["heliostat"]
+    with _served(out / "store-southern"):
+        _take_page(f"/heliostats/{name}", "second-heliostat", 1560)
+
+
+def draw_console(out: Path) -> None:
+    """Take pages of the field with faults, after all that they show is computed."""
+    with _served(out / "store-field") as address:
+        while json.load(urlopen(f"{address}/v1/attention"))["pending"]:
+            time.sleep(1)
+        _take_page("/", "console-field", 1000)
+        _take_page("/attention", "console-alarms", 1150)
+        _take_page("/heliostats/R04-12", "console-heliostat", 1330)
+
+
+@contextmanager
+def _served(store: Path) -> Iterator[str]:
+    """The address of a service on a store."""
     serve = [sys.executable, "-m", "service", "serve", "--port", str(PORT), "--json"]
-    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(out / "store-southern")}
+    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(store)}
     with Popen(serve, env=environment, stdout=PIPE) as service:
         try:
             assert service.stdout is not None
             service.stdout.readline()  # it is written once the service listens
-            page = f"{address}/heliostats/{report['heliostats'][0]['heliostat']}"
-            picture = out / "heliostat.png"
-            run(
-                ["chromium", "--headless", "--no-sandbox", "--hide-scrollbars",
-                 "--window-size=1280,1560", f"--screenshot={picture}", page],
-                check=True, capture_output=True,
-            )  # fmt: skip
+            yield f"http://127.0.0.1:{PORT}"
         finally:
             service.terminate()
-    page_picture = PICTURE.with_name("second-heliostat.jpg")
-    cv2.imwrite(str(page_picture), cv2.imread(str(picture)), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def _take_page(path: str, name: str, height: int) -> None:
+    """Take a page of the service, 1280 pixels wide; the second time all that it shows is known."""
+    with TemporaryDirectory() as folder:
+        picture = Path(folder) / "page.png"
+        for _ in range(2):
+            run(
+                ["chromium", "--headless", "--no-sandbox", "--hide-scrollbars",
+                 "--virtual-time-budget=20000", f"--window-size=1280,{height}",
+                 f"--screenshot={picture}", f"http://127.0.0.1:{PORT}{path}"],
+                check=True, capture_output=True,
+            )  # fmt: skip
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
+        cv2.imwrite(str(PICTURE.with_name(f"{name}.jpg")), cv2.imread(str(picture)), quality)
 
 
 PORT = 8123
@@ -134,3 +162,4 @@ if __name__ == "__main__":
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo")
     draw(folder)
     draw_second_plant(folder / "southern")
+    draw_console(folder)
