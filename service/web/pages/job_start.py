@@ -15,10 +15,10 @@ from service.jobs.kinds import calibrations, imports, predictions
 from service.jobs.kinds.calibrations import CalibrationIn
 from service.jobs.kinds.imports import ImportIn, allowed_folder, allowed_root
 from service.jobs.kinds.predictions import PredictionsIn
-from service.web.auth.dependencies import OPERATE, IdentityDep, RuntimeDep
+from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, render
 
-router = APIRouter(include_in_schema=False, prefix="/jobs", dependencies=[OPERATE])
+router = APIRouter(include_in_schema=False, prefix="/jobs")
 
 _MOST_FOLDERS = 200
 
@@ -55,7 +55,7 @@ def _folders(root: Path | None) -> list[str]:
     return [".", *sorted(path.name for path in root.iterdir() if path.is_dir())][:_MOST_FOLDERS]
 
 
-@router.get("/start")
+@router.get("/start", dependencies=[READ])
 def get_start_page(
     request: Request, query: Annotated[StartQuery, Query()], runtime: RuntimeDep
 ) -> HTMLResponse:
@@ -78,7 +78,7 @@ def get_start_page(
         )
 
 
-@router.post("/predictions")
+@router.post("/predictions", dependencies=[OPERATE])
 def post_predictions_form(
     form: Annotated[StartQuery, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
@@ -87,7 +87,7 @@ def post_predictions_form(
     return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
 
 
-@router.post("/calibrations")
+@router.post("/calibrations", dependencies=[OPERATE])
 def post_calibrations_form(
     form: Annotated[CalibrationForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
@@ -97,7 +97,7 @@ def post_calibrations_form(
     return go_to(f"/jobs/{enqueue(runtime, calibrations.KIND, payload, identity.name).id}")
 
 
-@router.post("/imports")
+@router.post("/imports", dependencies=[OPERATE])
 def post_imports_form(
     form: Annotated[ImportIn, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:

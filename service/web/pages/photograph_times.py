@@ -11,7 +11,7 @@ from sqlalchemy import func, select
 
 from model.errors import InvalidInputError
 from model.times import format_time
-from service.base.fields import Model, Reason, Version
+from service.base.fields import Lines, Model, Reason, Version
 from service.store.tables import HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.batches import (
@@ -27,6 +27,7 @@ from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
+    READ,
     IdentityDep,
     RuntimeDep,
     require_multipart,
@@ -34,7 +35,7 @@ from service.web.auth.dependencies import (
 from service.web.pages.photograph_list import PhotographsQuery, target_names
 from service.web.responses.pages import go_to, render
 
-router = APIRouter(include_in_schema=False, prefix="/photographs/times", dependencies=[OPERATE])
+router = APIRouter(include_in_schema=False, prefix="/photographs/times")
 
 _MAX_CSV = 2**20  # [bytes]
 _LISTED = 5
@@ -53,7 +54,7 @@ class ShiftForm(PhotographsQuery):
 class TimesForm(Model):
     """The form that stores what the preview showed, as CSV lines."""
 
-    lines: str
+    lines: Lines
     reason: Reason
     what: What = "times"
 
@@ -73,7 +74,7 @@ def _counts(runtime: Runtime) -> list[tuple[str, int]]:
     return [(name, count) for name, count in found]
 
 
-@router.get("")
+@router.get("", dependencies=[READ])
 def get_times_page(
     request: Request, query: Annotated[PhotographsQuery, Query()], runtime: RuntimeDep
 ) -> HTMLResponse:
@@ -125,13 +126,13 @@ def _read(
     return read_times(text, where, reason, zone)
 
 
-@router.post("/preview", dependencies=[Depends(require_multipart), COMPUTE_SLOT])
+@router.post("/preview", dependencies=[OPERATE, Depends(require_multipart), COMPUTE_SLOT])
 def post_lines_form(
     request: Request,
     runtime: RuntimeDep,
     reason: Annotated[Reason, Form()],
     what: Annotated[What, Form()] = "times",
-    lines: Annotated[str, Form(max_length=_MAX_CSV)] = "",
+    lines: Annotated[Lines, Form()] = "",
     file: Annotated[UploadFile | None, File()] = None,
 ) -> HTMLResponse:
     """What the lines or the file would change; nothing is stored."""
@@ -145,7 +146,7 @@ def post_lines_form(
     return _preview(request, runtime, given, what, reason)
 
 
-@router.post("/shift", dependencies=[COMPUTE_SLOT])
+@router.post("/shift", dependencies=[OPERATE, COMPUTE_SLOT])
 def post_shift_form(
     request: Request, form: Annotated[ShiftForm, Form()], runtime: RuntimeDep
 ) -> HTMLResponse:
@@ -155,7 +156,7 @@ def post_shift_form(
     return _preview(request, runtime, given, "times", form.reason)
 
 
-@router.post("", dependencies=[COMPUTE_SLOT])
+@router.post("", dependencies=[OPERATE, COMPUTE_SLOT])
 def post_times_form(
     form: Annotated[TimesForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
@@ -166,7 +167,7 @@ def post_times_form(
     return go_to("/photographs/times#recent-title")
 
 
-@router.post("/{number}/undo", dependencies=[COMPUTE_SLOT])
+@router.post("/{number}/undo", dependencies=[OPERATE, COMPUTE_SLOT])
 def post_undo_form(
     number: Annotated[Version, Path(description="Number of the audit trail's entry.")],
     runtime: RuntimeDep,

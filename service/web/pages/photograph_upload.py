@@ -34,7 +34,8 @@ from service.twin.photographs.repeats import ReceivedPhotograph, receive
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
-    INGEST,
+    OPERATE,
+    READ,
     IdentityDep,
     RuntimeDep,
     require_multipart,
@@ -42,7 +43,7 @@ from service.web.auth.dependencies import (
 from service.web.pages.photograph_list import target_names
 from service.web.responses.pages import render
 
-router = APIRouter(include_in_schema=False, prefix="/photographs/upload", dependencies=[INGEST])
+router = APIRouter(include_in_schema=False, prefix="/photographs/upload")
 
 _MOST = 200
 _TIME = re.compile(
@@ -128,13 +129,13 @@ def _page(
         )
 
 
-@router.get("")
+@router.get("", dependencies=[READ])
 def get_upload_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
     """The form, and what it costs."""
     return _page(request, runtime, None, [])
 
 
-@router.post("", dependencies=[Depends(require_multipart), COMPUTE_SLOT])
+@router.post("", dependencies=[OPERATE, Depends(require_multipart), COMPUTE_SLOT])
 def post_upload_form(
     request: Request,
     form: Annotated[UploadForm, Form()],

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from tests.service import real
 from tests.service.conftest import QUIET, Post, png
 from tests.service.spots import photographs
-from tests.service.web.pages import HTML, text_of
+from tests.service.web.pages import HTML, make_key, text_of
 
 
 @pytest.fixture
@@ -107,3 +108,16 @@ def test_a_calibration_shows_mounts_steps_outliers_and_why_it_skipped(
     # A later calibration of the same state replaces the mount.
     _started(client, "/jobs/calibrations")
     assert "calibrated again since" in text_of(client, f"/jobs/{job['id']}").words
+
+
+def test_a_reader_sees_costs_and_no_buttons(app: FastAPI, client: TestClient, post: Post):
+    post(png(1))
+    client.headers["Authorization"] = f"Bearer {make_key(app, 'read')}"
+    page = text_of(client, "/jobs/start?folder=stj")
+    assert "1\xa0surface, about" in page.words
+    assert page.words.count("Starting it needs the role operate.") == 3
+    assert not [
+        form for form in page.all("form") if "/jobs/" in form["action"] and form["method"] == "post"
+    ]
+    for path in ("/photographs/times", "/photographs/upload"):
+        assert "needs the role operate" in text_of(client, path).words
