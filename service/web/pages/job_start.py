@@ -92,6 +92,8 @@ def post_calibrations_form(
     form: Annotated[CalibrationForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Enqueue a calibration, and go to the page of the job."""
+    with runtime.database.reading() as session:
+        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
     names = None if form.heliostat is None else [form.heliostat]
     payload = CalibrationIn(heliostats=names, since=form.since, until=form.until)
     return go_to(f"/jobs/{enqueue(runtime, calibrations.KIND, payload, identity.name).id}")

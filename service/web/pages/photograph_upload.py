@@ -88,8 +88,8 @@ def time_in_name(name: str, zone: str) -> datetime | None:
 
 def _photograph(runtime: Runtime, form: UploadForm, name: str) -> Photograph:
     with runtime.database.reading() as session:
-        taken_at = time_in_name(name, plant_time_zone(session, runtime.settings.time_zone))
-        taken_at = taken_at or form.taken_at
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        taken_at = time_in_name(name, zone) or form.in_utc(zone).taken_at
         if form.azimuth_deg is not None and form.elevation_deg is not None:
             sun = Sun(azimuth_deg=form.azimuth_deg, elevation_deg=form.elevation_deg)
         elif taken_at is not None:
