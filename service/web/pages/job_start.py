@@ -15,6 +15,7 @@ from service.jobs.kinds import calibrations, imports, predictions
 from service.jobs.kinds.calibrations import CalibrationIn
 from service.jobs.kinds.imports import ImportIn, allowed_folder, allowed_root
 from service.jobs.kinds.predictions import PredictionsIn
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to, render
 
