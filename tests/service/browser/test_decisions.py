@@ -220,7 +220,7 @@ def test_flux_of_the_field_has_units(seen: Any):
 @SIZES
 def test_tables_and_figures_are_taken_along(seen: Any):
     seen.goto("/heliostats/AA39")
-    seen.click("figure:has(a[href*='figure=deviation']) .export summary")
+    seen.click("section:has(#surface-title) .export summary")
     for suffix in ("npz", "png"):
         with seen.expect_download() as taken:
             seen.click(f"a[href*='figure=deviation&format={suffix}']")
