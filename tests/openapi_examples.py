@@ -296,7 +296,8 @@ def study(record: Recorder) -> None:
     record.call("adopt_study", f"POST {path}/adopt", 201, json=reason)
     record.call("list_models", "GET /v1/models")
     record.call("get_current_model", "GET /v1/models/current")
-    record.call("withdraw_study", f"POST {path}/withdraw")
+    withdrawn = {"reason": "it was declared for another camera"}
+    record.call("withdraw_study", f"POST {path}/withdraw", json=withdrawn)
 
 
 def administrate(record: Recorder, key: str) -> None:

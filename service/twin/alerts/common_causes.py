@@ -4,6 +4,7 @@ Alerts of one reason that began within a day, and more often than usual, are a b
 knows of that time is evidence of its cause. Bursts with the same evidence have one cause.
 """
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -117,10 +118,8 @@ def find_bursts(alerts: Sequence[Alert]) -> list[tuple[Alert, ...]]:
     bursts = []
     rest = sorted(alerts, key=lambda alert: alert.since)
     while len(rest) >= MIN_ALERTS:
-        ends = [
-            sum(one.since <= alert.since + _WINDOW for one in rest[place:]) + place
-            for place, alert in enumerate(rest)
-        ]
+        moments = [alert.since for alert in rest]
+        ends = [bisect_right(moments, moment + _WINDOW) for moment in moments]
         start = max(range(len(rest)), key=lambda place: ends[place] - place)
         burst, others = rest[start : ends[start]], rest[:start] + rest[ends[start] :]
         span = rest[-1].since - rest[0].since
