@@ -4,10 +4,24 @@ import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from service.base.settings import Settings
+from service.cli.demo_field import write_layout
+from service.sources.folder import read_folder
 from service.twin.alerts.alerts import Alert
 from service.twin.alerts.common_causes import find_bursts
-from tests.service.conftest import client_of
+from service.twin.transfer.importing import import_folder
+from service.web.app import create_app
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    tower_document,
+)
 from tests.service.storm import CLOCK, UNDATED, make_storm, storm_app
+from tests.service.web.test_attention import Blind, recent
 
 HTML = {"Accept": "text/html"}
 PATH = "/v1/attention"
@@ -61,3 +75,38 @@ def test_bursts_are_more_than_the_usual_number():
     assert len(burst) == 12
     assert find_bursts(alerts(*(k / 5 for k in range(300)))) == []  # five on every day
     assert len(find_bursts(alerts(*together, *(day + 40 for day in together)))) == 2
+
+
+def test_evidence_of_what_photographs_have_in_common(tmp_path: Path):
+    """All that were photographed in a windy hour are forecast poorly."""
+    app = create_app(Settings(data_dir=tmp_path, **QUIET), Blind())
+    with client_of(app) as client:
+        client.put("/v1/plant", json=tower_document())
+        for number in range(6):
+            client.put(f"/v1/heliostats/H{number}", json=properties_document())
+            about = recent() | {"wind_speed_m_s": 12.0}
+            poster(client)(png(number), f"H{number}", **recent())
+            made = client.post(f"/v1/heliostats/H{number}/surfaces", json={"method": "network"})
+            assert made.status_code == 201
+            poster(client)(png(number + 10), f"H{number}", **about)
+        (cause,) = client.get(f"{PATH}/causes").json()["items"]
+        assert cause["alerts"] == {"accuracy": 6}
+        assert cause["evidence"] == [
+            "6 of 6 heliostats that were photographed at that time are affected, as by haze or a"
+            " camera",
+            "all photographs were taken on lower",
+            "the wind was 12 m/s",
+        ]
+
+
+def test_evidence_that_a_field_was_added_and_not_photographed(tmp_path: Path):
+    settings = Settings(data_dir=tmp_path / "data", **QUIET, attention_photograph_days=1e-7)
+    app = create_app(settings, FakeOperations())
+    with client_of(app) as client:
+        plant = write_layout(tmp_path / "plant", 1)
+        folder = read_folder(tmp_path / "plant", [], whole_field=True)
+        import_folder(app.state.runtime, folder)
+        (cause,) = client.get(f"{PATH}/causes").json()["items"]
+        assert cause["alerts"] == {"no_photograph": len(plant.heliostats)}
+        assert cause["evidence"][0] == "no photograph with a known time was ever accepted"
+        assert cause["evidence"][1].startswith("the heliostats were added on ")
