@@ -59,6 +59,7 @@ class Column:
     style: str
     is_page_only: bool
     is_first: bool
+    is_hidden: bool = False
 
 
 @dataclass
@@ -71,6 +72,8 @@ class PageTable:
 
     columns: dict[str, Column] = field(default_factory=dict)
     rows: list[dict[str, object]] = field(default_factory=list)
+    shown: frozenset[str] = frozenset()
+    """Headings of the columns that the page shows besides the first; all if there are none."""
 
     def add(
         self, heading: str, value: object, label: str, style: str | None, is_page_only: bool
@@ -80,7 +83,8 @@ class PageTable:
         if style is None:
             style = "number" if isinstance(value, Quantity | int) and not is_first else ""
         self.rows[-1][heading] = value
-        column = Column(label or heading, style, is_page_only, is_first)
+        is_hidden = bool(self.shown) and heading not in self.shown and not is_first
+        column = Column(label or heading, style, is_page_only, is_first, is_hidden)
         self.columns.setdefault(heading, column)
         return column
 

@@ -10,7 +10,7 @@ from functools import cache
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlencode
+from urllib.parse import parse_qsl, quote, urlencode
 
 from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -88,10 +88,19 @@ class _Rendering:
 _RENDERING: ContextVar[_Rendering] = ContextVar("rendering")
 
 
-def _new_table(name: str) -> PageTable:
-    """Begin a table of the page. The URL ``link_to_table`` is its CSV."""
-    made = _RENDERING.get().tables[name] = PageTable()
+def _new_table(name: str, has_choice: bool = False) -> PageTable:
+    """Begin a table of the page. The URL ``link_to_table`` is its CSV.
+
+    With ``has_choice`` the page shows the columns that its query names, all by default.
+    """
+    chosen = [value for key, value in _query() if has_choice and key == "columns"]
+    made = _RENDERING.get().tables[name] = PageTable(shown=frozenset(chosen))
     return made
+
+
+def _query() -> list[tuple[str, str]]:
+    """Names and values of the page's query."""
+    return parse_qsl(_RENDERING.get().page.partition("?")[2])
 
 
 def _add_cell(*cell: Any) -> Column:
@@ -136,6 +145,7 @@ def _environment() -> Environment:
     made.globals.update(asset=asset, htmx_settings=json.dumps(_HTMX))
     made.globals.update(link_to_table=_link_to_table, link_to_figure=_link_to_figure)
     made.globals.update(new_table=_new_table, add_cell=_add_cell, has_guide=has_guide)
+    made.globals.update(query=_query)
     made.globals.update(plant_zone=_zone)
     made.filters.update(
         shown=_shown, moment=_moment, form_time=lambda value: form_time(value, _zone())

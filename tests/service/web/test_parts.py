@@ -198,3 +198,19 @@ def test_plan_as_tables_maps_and_timelines(app: FastAPI, two_heliostats: TestCli
     }  # three maps, three timelines, three tables
     for link in links:
         check(two_heliostats.get(link))
+
+
+def test_columns_of_photographs_are_chosen(shown: TestClient):
+    path = "/heliostats/AA39?photographs=used&columns=Target&columns=Saturated"
+    page = Page(shown.get(path, headers={"Accept": "text/html"}).text)
+    table = page.one("table", id="photographs")
+    assert [one.words for one in table.all("th", scope="col")] == [
+        "Photograph",
+        "Target",
+        "Saturated",
+    ]
+    assert {len(row.all("td")) for row in table.all("tr")[1:]} == {2}
+    ticked = [one["value"] for one in page.all("input", name="columns", checked=True)]
+    assert ticked == ["Target", "Saturated"]
+    assert page.one("input", type="hidden", name="photographs")["value"] == "used"
+    assert "Judged" in sheet(shown, f"{path}&table=photographs")[0]  # the CSV has all
