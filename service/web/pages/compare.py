@@ -170,9 +170,7 @@ def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
         return _side(session, query.heliostat, before), second
     after = session.scalar(of_heliostat.where(SurfaceRow.version > second.surface.version))
     if after is None:
-        raise NotFoundError(
-            f"heliostat {query.heliostat} has one surface only; name another heliostat"
-        )
+        raise NotFoundError(f"heliostat {query.heliostat} has one surface only")
     return second, _side(session, query.heliostat, after)
 
 
@@ -343,6 +341,7 @@ class _ComparisonData:
     """
 
     sides: tuple[Side, Side] | None
+    alone: str | None
     compared: Sequence[ComparisonResult | None]
     targets: Sequence[str]
     sun: tuple[float, float]
@@ -356,7 +355,15 @@ def _read(
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
         azimuth, elevation = sun_now(session.get(PlantRow, 1))
         zone = plant_time_zone(session, runtime.settings.time_zone)
-        sides = None if query.heliostat is None else _sides(session, query)
+        sides, alone = None, None
+        if query.heliostat is not None:
+            store.get_heliostat(session, query.heliostat)
+            try:
+                sides = _sides(session, query)
+            except NotFoundError as error:
+                if (query.version, query.other, query.other_version) != (None, None, None):
+                    raise
+                alone = str(error)
         if sides is not None:
             _require_as_many_facets(*sides)
         shown = [
@@ -365,7 +372,7 @@ def _read(
     compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
     given = query.azimuth_deg, query.elevation_deg
     sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
-    return _ComparisonData(sides, compared, targets, sun, zone)
+    return _ComparisonData(sides, alone, compared, targets, sun, zone)
 
 
 @router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
@@ -380,7 +387,7 @@ def get_compare_page(
     filled = {"query": query, "sun": read.sun, "target": target, "targets": read.targets}
     page = partial(render, request, "compare.html", **filled)
     if read.sides is None:
-        return page(sides=None)
+        return page(sides=None, alone=read.alone)
     known = [one for one in read.compared if one is not None]
     forecasts, trouble = None, next((one.trouble for one in known if one.trouble), None)
     try:
@@ -390,6 +397,7 @@ def get_compare_page(
     is_whole = len(known) == len(read.compared)
     return page(
         sides=read.sides,
+        alone=None,
         surfaces=_surfaces(*read.sides, runtime.settings.figure_scales),
         change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),
         forecasts=forecasts,

@@ -106,13 +106,17 @@ def test_two_heliostats_are_compared(pages: TestClient, post: Post):
     assert "AB01 1</text>" in page
 
 
-@pytest.mark.parametrize("query", ["heliostat=none", "heliostat=AB01", "heliostat=AA39&version=9"])
+@pytest.mark.parametrize(
+    "query", ["heliostat=none", "heliostat=AB01&version=1", "heliostat=AA39&version=9"]
+)
 def test_what_is_not_there_is_named(pages: TestClient, query: str):
     assert "<h1>Not Found" in text_of(pages, f"/compare?{query}", 404)
 
 
 def test_one_surface_has_nothing_to_be_compared_with(pages: TestClient):
-    assert "AB01" in text_of(pages, "/compare?heliostat=AB01", 404)
+    page = text_of(pages, "/compare?heliostat=AB01")
+    assert "Heliostat AB01 has no surface yet. Name another heliostat" in page.words
+    assert "/jobs/start?heliostat=AB01" in page.links
 
 
 @pytest.mark.parametrize("query", ["since=yesterday", "version=x", "elevation_deg=91"])

@@ -153,3 +153,22 @@ def test_tiles_have_the_state_of_the_plant(home: TestClient):
     page = text_of(home, "/?period=7")
     assert "Updated 20" in page.one(id="state").words
     assert page.one("input", name="period")["value"] == "7"  # the filter keeps it
+
+
+def test_comparison_with_one_surface_says_how_to_get_another(home: TestClient):
+    page = text_of(home, "/compare?heliostat=AA39")
+    assert "Heliostat AA39 has one surface only" in page.words
+    assert "/jobs/start?heliostat=AA39" in page.links
+    assert page.one("input", name="heliostat")["value"] == "AA39"
+    text_of(home, "/compare?heliostat=AA3")  # one without a surface
+    text_of(home, "/compare?heliostat=none", 404)
+
+
+def test_pictures_are_links(home: TestClient):
+    for path in ("/heliostats/AA39/photographs/102", "/heliostats/AA39"):
+        page = text_of(home, path)
+        pictures = [one for one in page.all("img") if one.attributes.get("alt")]
+        assert pictures
+        for picture in pictures:
+            assert picture.parent is not None
+            assert picture.parent.tag == "a", picture.attributes
