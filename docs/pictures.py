@@ -114,7 +114,7 @@ def draw_second_plant(out: Path) -> None:
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     name = report["heliostats"][0]["heliostat"]
     with _served(out / "store-southern"):
-        _take_page(f"/heliostats/{name}", "second-heliostat", 1560)
+        _take_page(f"/heliostats/{name}", "second-heliostat", 1900)
 
 
 def draw_console(out: Path) -> None:
