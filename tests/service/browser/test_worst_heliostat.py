@@ -10,7 +10,7 @@ import pytest
 from service.web.app import create_app
 from tests.service import real
 from tests.service.browser.browsing import DESK, PHONE, GatedOperations, Served, expect, violations
-from tests.service.browser.test_shift import AXE, TOO_WIDE
+from tests.service.browser.test_shift import AXE, LOW, TOO_WIDE
 from tests.service.conftest import free_port, serving
 from tests.service.twin.test_causes import add_photographs, lay_out, veil
 
@@ -73,6 +73,7 @@ def check(page: Any) -> None:
         page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
         assert violations(page, **AXE) == [], (page.url, scheme)
         assert page.evaluate(TOO_WIDE) <= 0, page.url
+    assert page.evaluate(LOW) == [], page.url
     page.set_viewport_size(DESK)
     page.emulate_media(color_scheme="light")
 
