@@ -142,8 +142,8 @@ def test_correction_is_of_the_photograph_in_all_its_images(known: TestClient, po
         assert kept["before"] == {"sun.azimuth_deg": 160.0, "excluded": False}
     assert known.post("/v1/heliostats/AA39/surfaces", json={}).json()["measurements"] == ["2"]
     excluded = known.get("/heliostats/AA39?photographs=excluded", headers=HTML).text
-    assert "/heliostats/AA39/photographs/1" in excluded
-    assert "/heliostats/AA39/photographs/2" not in excluded
+    assert '/heliostats/AA39/photographs/1">1</a>' in excluded
+    assert '/heliostats/AA39/photographs/2">2</a>' not in excluded
     # An image of it that comes later is excluded too.
     late = post(png(5), id="1", kind="raw", sun=sun_at(150.0)).json()
     assert (late["accepted"], late["reason"]) == (False, "excluded")
