@@ -30,8 +30,8 @@ class AcknowledgementBatch:
     """Alerts that were acknowledged together, with the number of those of each reason."""
 
     id: int
-    made_at: datetime
-    made_by: str
+    created_at: datetime
+    created_by: str
     comment: str
     undone_at: datetime | None
     undone_by: str | None

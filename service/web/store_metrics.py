@@ -55,7 +55,8 @@ class StoreCollector(Collector):
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
                 alerts = list_alerts(session, self._cache, self._runtime.settings)
                 found.append(_attention(alerts.alerts))
-                found.append(_cameras(self._cache.cameras.changes(session, self._runtime.settings)))
+                cameras = self._cache.cameras.read(session, self._runtime.settings)
+                found.append(_cameras(cameras.changes))
                 found += self._cache.recent(
                     session, "metrics", partial(self._of_heliostats, session)
                 )

@@ -109,11 +109,10 @@ def list_alerts(session: Session, cache: FieldOverviewCache, settings: Settings)
     """List all alerts, sorted by urgency of the reason, then by time with the newest first."""
 
     def read_alerts() -> AlertList:
-        field, cameras = cache.read(session, PATIENCE_S), cache.cameras.changes(session, settings)
-        lost = find_lost_light(cache.cameras.light(session), settings.attention_light_loss)
-        return AlertList(
-            alerts_of_heliostats(session, field.lines, settings, cameras, lost), field.pending
-        )
+        field, cameras = cache.read(session, PATIENCE_S), cache.cameras.read(session, settings)
+        lost = find_lost_light(cameras.light, settings.attention_light_loss)
+        alerts = alerts_of_heliostats(session, field.lines, settings, cameras.changes, lost)
+        return AlertList(alerts, field.pending)
 
     return cache.recent(session, "attention", read_alerts)
 

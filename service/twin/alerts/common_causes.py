@@ -65,12 +65,12 @@ class CommonCause:
     evidence: tuple[str, ...]
 
     @property
-    def first(self) -> datetime:
+    def first_at(self) -> datetime:
         """Since when the oldest alert lasts."""
         return min(alert.since for alert in self.alerts)
 
     @property
-    def last(self) -> datetime:
+    def last_at(self) -> datetime:
         """Since when the newest alert lasts."""
         return max(alert.since for alert in self.alerts)
 
@@ -140,12 +140,12 @@ def _evidence(
 ) -> Iterator[str]:
     """What the store knows of the time when a burst began, the most specific first."""
     reason, cause = burst[0].reason, CommonCause(burst, ())
-    before = cause.first - _WINDOW
+    before = cause.first_at - _WINDOW
     for alert in alerts:
-        if reason in _CAUSED.get(alert.reason, ()) and before <= alert.since <= cause.last:
+        if reason in _CAUSED.get(alert.reason, ()) and before <= alert.since <= cause.last_at:
             yield f"{REASONS[alert.reason].label.lower()}: {alert.message}"
     if reason in _BY_MODEL:
-        yield from _models(session, before, cause.last)
+        yield from _models(session, before, cause.last_at)
     if reason in _BY_JOB:
         yield from _jobs(session, _BY_JOB[reason], cause)
     if reason in ("accuracy", "fell"):
@@ -165,7 +165,7 @@ def _models(session: Session, first: datetime, last: datetime) -> Iterator[str]:
 
 def _jobs(session: Session, kind: str, cause: CommonCause) -> Iterator[str]:
     ran = select(JobRow.id).where(
-        JobRow.kind == kind, JobRow.started_at <= cause.last, JobRow.finished_at >= cause.first
+        JobRow.kind == kind, JobRow.started_at <= cause.last_at, JobRow.finished_at >= cause.first_at
     )
     for number in session.scalars(ran.order_by(JobRow.id)):
         yield f"job {number} ({kind}) ran at that time"
@@ -175,7 +175,7 @@ def _photographed(session: Session, cause: CommonCause) -> Iterator[str]:
     """Whether nearly all heliostats that were photographed at that time are affected."""
     row = MeasurementRow
     query = select(func.count(row.heliostat_id.distinct())).where(
-        row.accepted, row.taken_at.between(cause.first, cause.last)
+        row.accepted, row.taken_at.between(cause.first_at, cause.last_at)
     )
     count, affected = session.scalar(query) or 0, len(cause.heliostats)
     if affected >= _NEARLY_ALL * count:
@@ -193,7 +193,7 @@ def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterat
         select(TargetRow.name, row.sent_by, row.wind_speed_m_s, row.warnings)
         .join(TargetRow, TargetRow.id == row.target_id)
         .join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
-        .where(moment.between(cause.first, cause.last))
+        .where(moment.between(cause.first_at, cause.last_at))
         .where(HeliostatRow.name.in_(cause.heliostats[:_MOST_NAMES]))
     )
     rows = session.execute(query).all()
@@ -220,7 +220,7 @@ def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterat
 def _unphotographed(session: Session, cause: CommonCause, settings: Settings) -> Iterator[str]:
     """Whether nobody photographed the field, or the heliostats were added together."""
     allowed = timedelta(days=settings.attention_photograph_days)
-    last = cause.last - allowed
+    last = cause.last_at - allowed
     newest = session.scalar(
         select(func.max(MeasurementRow.taken_at)).where(MeasurementRow.accepted)
     )

@@ -123,6 +123,13 @@ def _of_day(session: Session, day: date) -> _DayFigures:
     return _DayFigures(medians, light)
 
 
+class CameraReadings(NamedTuple):
+    """What cameras saw: changes of themselves, and the light of heliostats."""
+
+    changes: list[CameraChange]
+    light: list[LightReading]
+
+
 class CameraWatch:
     """Daily figures of all targets, cached except for the current day."""
 
@@ -130,19 +137,18 @@ class CameraWatch:
         self._lock = threading.Lock()
         self._days: TTLCache[date, _DayFigures] = TTLCache(2 * _WINDOW_DAYS, _HOLDS_S)
 
-    def changes(self, session: Session, settings: Settings) -> list[CameraChange]:
-        """Camera changes, in the order of target names."""
+    def read(self, session: Session, settings: Settings) -> CameraReadings:
+        """Camera changes in the order of target names, and the light of all days, newest first."""
         days = self._read(session, now().date())
         daily: dict[str, dict[date, NDArray[np.float64]]] = defaultdict(dict)
         for day, of in days.items():
             for name, medians in of.medians.items():
                 daily[name][day] = medians
         found = (find_camera_change(name, daily[name], settings) for name in sorted(daily))
-        return [change for change in found if change is not None]
-
-    def light(self, session: Session) -> list[LightReading]:
-        """Light of the photographs of all days, the newest day first."""
-        return [one for day in self._read(session, now().date()).values() for one in day.light]
+        return CameraReadings(
+            [change for change in found if change is not None],
+            [one for day in days.values() for one in day.light],
+        )
 
     def _read(self, session: Session, today: date) -> dict[date, _DayFigures]:
         days = {}

@@ -98,8 +98,8 @@ class AcknowledgementOut(BaseModel):
     """Alerts that were acknowledged together."""
 
     id: Id
-    made_at: CreatedAt
-    made_by: Author
+    created_at: CreatedAt
+    created_by: Author
     reason: str = Field(description="Why; empty if it was acknowledged before reasons were asked.")
     alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
     undone_at: datetime | None = Field(description="When it was undone; null: it was not.")
@@ -133,8 +133,8 @@ class CommonCauseOut(BaseModel):
     """Alerts that probably have one cause."""
 
     alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
-    first: From
-    last: datetime = Field(description="When the newest of them began.")
+    first_at: From
+    last_at: datetime = Field(description="When the newest of them began.")
     evidence: list[str] = Field(
         description="What the store knows of that time; empty if it knows nothing."
     )
@@ -264,7 +264,15 @@ def _acknowledgement(row: AcknowledgementBatch) -> AcknowledgementOut:
 
 def _history(entry: AlarmHistory) -> AlertHistoryOut:
     made = [
-        from_row(AcknowledgementOut, row, id=row.batch, reason=row.comment, alerts={row.reason: 1})
+        from_row(
+            AcknowledgementOut,
+            row,
+            id=row.batch,
+            created_at=row.made_at,
+            created_by=row.made_by,
+            reason=row.comment,
+            alerts={row.reason: 1},
+        )
         for row in entry.acknowledgements
     ]
     severity = REASONS[cast(Reason, entry.row.reason)].severity

@@ -442,7 +442,7 @@ def test_group_is_acknowledged_with_a_reason_and_undone(stale: TestClient):
     seen = items(stale)
     assert {item["acknowledged_reason"] for item in seen} == {"Follows from another alarm"}
     (batch,) = stale.get(f"{PATH}/acknowledgements").json()["items"]
-    assert (batch["made_by"], batch["alerts"]) == ("local", {"no_photograph": 3})
+    assert (batch["created_by"], batch["alerts"]) == ("local", {"no_photograph": 3})
     assert {item["acknowledgement"] for item in seen} == {batch["id"]}
     undo = f"{PATH}/acknowledgements/{batch['id']}/undo"
     assert stale.post(undo).json()["undone_by"] == "local"
@@ -471,7 +471,7 @@ def test_history_of_alarms(app: FastAPI, client: TestClient, post: Post):
         item["since"],
     )
     assert entry["opened_at"] < entry["closed_at"]
-    assert [(one["made_by"], one["reason"]) for one in entry["acknowledgements"]] == [
+    assert [(one["created_by"], one["reason"]) for one in entry["acknowledgements"]] == [
         ("local", "seen")
     ]
     page = client.get("/attention/history", headers=HTML).text
