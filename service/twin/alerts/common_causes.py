@@ -165,7 +165,9 @@ def _models(session: Session, first: datetime, last: datetime) -> Iterator[str]:
 
 def _jobs(session: Session, kind: str, cause: CommonCause) -> Iterator[str]:
     ran = select(JobRow.id).where(
-        JobRow.kind == kind, JobRow.started_at <= cause.last_at, JobRow.finished_at >= cause.first_at
+        JobRow.kind == kind,
+        JobRow.started_at <= cause.last_at,
+        JobRow.finished_at >= cause.first_at,
     )
     for number in session.scalars(ran.order_by(JobRow.id)):
         yield f"job {number} ({kind}) ran at that time"
