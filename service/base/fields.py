@@ -5,7 +5,7 @@ URLs.
 """
 
 from collections.abc import Iterable
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, time, timedelta
 from itertools import islice
 from typing import Annotated, Any, Literal, Self, TypeVar
 from zoneinfo import ZoneInfo
@@ -153,6 +153,28 @@ def plant_time_to_utc(moment: datetime, zone: str) -> datetime:
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=ZoneInfo(zone))
     return moment.astimezone(UTC)
+
+
+def _read_form_day(text: Any) -> Any:
+    if type(text) is date:
+        return text
+    try:
+        day = date.fromisoformat(str(text).strip())
+    except ValueError as error:
+        raise ValueError("give a day as 2026-06-21, in the plant's time zone") from error
+    parse_moment(datetime.combine(day, time()))
+    return day
+
+
+FormDay = Annotated[date, BeforeValidator(_read_form_day)]
+"""Days in forms: ``2026-06-21``, in the plant's time zone; see `start_of_day`."""
+
+
+def start_of_day(day: date | None, zone: str, later: int = 0) -> datetime | None:
+    """The start in UTC of a day of a form, or of the day ``later`` days after it."""
+    if day is None:
+        return None
+    return plant_time_to_utc(datetime.combine(day + timedelta(days=later), time()), zone)
 
 
 # Fields of responses.

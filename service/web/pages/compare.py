@@ -5,7 +5,6 @@ Maps share one scale. The page also shows the forecasts of both surfaces, and th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime, time, timedelta
 from functools import partial
 from statistics import fmean
 from typing import Annotated
@@ -22,7 +21,17 @@ from model.metrics import flux_accuracy
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
-from service.base.fields import AZIMUTH, ELEVATION, Model, Name, Sun, Version, drop_empty_fields
+from service.base.fields import (
+    AZIMUTH,
+    ELEVATION,
+    FormDay,
+    Model,
+    Name,
+    Sun,
+    Version,
+    drop_empty_fields,
+    start_of_day,
+)
 from service.base.settings import Settings
 from service.drawing import charts
 from service.drawing.charts import HeatMap
@@ -63,7 +72,8 @@ class CompareQuery(Model):
 
     Without versions, the page compares the active surface with the version before it. If the active
     surface is the first, the page compares it with the newest. For two heliostats, both surfaces
-    are the active ones. ``since`` and ``until`` are days.
+    are the active ones. ``since`` and ``until`` are days in
+    the plant's zone.
     """
 
     heliostat: Name | None = None
@@ -73,22 +83,14 @@ class CompareQuery(Model):
     target: Name | None = None
     azimuth_deg: Annotated[float, AZIMUTH] | None = None
     elevation_deg: Annotated[float, ELEVATION] | None = None
-    since: date | None = None
-    until: date | None = None
+    since: FormDay | None = None
+    until: FormDay | None = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
-    @property
-    def span(self) -> Period:
-        """From the beginning of the first day to the end of the last, in UTC."""
-        return Period(
-            None if self.since is None else datetime.combine(self.since, time(), UTC),
-            (
-                None
-                if self.until is None
-                else datetime.combine(self.until, time(), UTC) + timedelta(days=1)
-            ),
-        )
+    def span(self, zone: str) -> Period:
+        """From the beginning of the first day to the end of the last, in the plant's ``zone``."""
+        return Period(start_of_day(self.since, zone), start_of_day(self.until, zone, 1))
 
 
 @dataclass(frozen=True)
@@ -366,9 +368,8 @@ def _read(
                 alone = str(error)
         if sides is not None:
             _require_as_many_facets(*sides)
-        shown = [
-            cache.read(session, side.heliostat, side.surface, query.span) for side in sides or ()
-        ]
+        span = query.span(zone)
+        shown = [cache.read(session, side.heliostat, side.surface, span) for side in sides or ()]
     compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
     given = query.azimuth_deg, query.elevation_deg
     sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
@@ -403,6 +404,6 @@ def get_compare_page(
         forecasts=forecasts,
         trouble=trouble,
         unseen=_unseen(known) if is_whole else None,
-        timelines=_timelines(read, read.sides, query.span, runtime.settings),
+        timelines=_timelines(read, read.sides, query.span(read.zone), runtime.settings),
         again=None if is_whole else str(request.url.query),
     )

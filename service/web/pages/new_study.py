@@ -1,9 +1,7 @@
 """Form of a study: heliostats, days, surfaces and effects, with its cost before it starts."""
 
 from collections.abc import Sequence
-from datetime import date, datetime, time, timedelta
 from typing import Annotated
-from zoneinfo import ZoneInfo
 
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -15,7 +13,7 @@ from model.effects import CATALOGUE
 from model.errors import InvalidInputError
 from model.study.loop import MIN_IMAGES
 from service import store
-from service.base.fields import Model, Text, drop_empty_fields
+from service.base.fields import FormDay, Model, Text, drop_empty_fields, start_of_day
 from service.base.names import LINE
 from service.jobs.costs import study_cost
 from service.jobs.enqueuing import enqueue
@@ -42,8 +40,8 @@ class NewStudyForm(Model):
     heliostats: Annotated[str, StringConstraints(pattern=LINE, max_length=8000)] = ""
     max_heliostats: int = 12
     images: int = 12
-    since: date | None = None
-    until: date | None = None
+    since: FormDay | None = None
+    until: FormDay | None = None
     surfaces: Surfaces = "current"
     candidates: list[Text] = Field(default=[], max_length=100)
 
@@ -63,19 +61,13 @@ class NewStudyForm(Model):
                 heliostats=names or None,
                 max_heliostats=self.max_heliostats,
                 images=self.images,
-                since=None if self.since is None else _midnight(self.since, zone),
-                until=None
-                if self.until is None
-                else _midnight(self.until + timedelta(days=1), zone),
+                since=start_of_day(self.since, zone),
+                until=start_of_day(self.until, zone, 1),
                 surfaces=self.surfaces,
                 candidates=self.candidates if 0 < len(self.candidates) < len(CATALOGUE) else None,
             )
         except ValidationError as error:
             raise RequestValidationError(error.errors()) from error
-
-
-def _midnight(day: date, zone: str) -> datetime:
-    return datetime.combine(day, time(), ZoneInfo(zone))
 
 
 def _names(session: Session, words: Sequence[str]) -> list[str]:
@@ -105,7 +97,6 @@ def get_new_study_page(
             request,
             "new_study.html",
             form=form,
-            zone=zone,
             effects={name: kind.about.partition(": ")[2] for name, kind in CATALOGUE.items()},
             extent=extent,
             cost=study_cost(session, extent.n_photographs, payload.candidates),

@@ -1,18 +1,17 @@
 """Page of all photographs, newest first, filtered by heliostat, verdict, target and time."""
 
 from collections.abc import Sequence
-from datetime import UTC, date, datetime, time, timedelta
 from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service import store
-from service.base.fields import Model, Name, Version, drop_empty_fields
+from service.base.fields import FormDay, Model, Name, Version, drop_empty_fields, start_of_day
 from service.store.photographs.groups import (
     PhotographFilter,
     PhotographVerdict,
@@ -20,6 +19,7 @@ from service.store.photographs.groups import (
     list_groups,
 )
 from service.store.tables import TargetRow
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.dependencies import READ, RENDER_SLOT, RuntimeDep
 from service.web.responses.pages import render
 
@@ -32,15 +32,16 @@ LISTED = 50
 class PhotographsQuery(Model):
     """Filters of the list.
 
-    ``since`` and ``until`` are days in UTC, both inclusive. ``before`` is where the page begins.
-    ``time`` is whether the time of a photograph is known, and ``warned`` whether it has warnings.
+    ``since`` and ``until`` are days in the plant's zone, both inclusive. ``before`` is where the
+    page begins. ``time`` is whether the time of a photograph is known, and ``warned`` whether it
+    has warnings.
     """
 
     heliostat: Name | None = None
     verdict: PhotographVerdict | None = None
     target: Name | None = None
-    since: date | None = None
-    until: date | None = Field(default=None, lt=date.max)
+    since: FormDay | None = None
+    until: FormDay | None = None
     time: TimeState | None = None
     warned: bool | None = None
     before: Version | None = None
@@ -64,21 +65,17 @@ class PhotographsQuery(Model):
             for name, value in asked.items()
         }
 
-    def filter(self, session: Session) -> PhotographFilter:
+    def filter(self, session: Session, zone: str) -> PhotographFilter:
         """The same as a filter; NotFoundError if heliostat or target are not stored."""
         return PhotographFilter(
             None if self.heliostat is None else store.get_heliostat(session, self.heliostat),
             None if self.target is None else store.get_target(session, self.target),
             self.verdict,
-            _midnight(self.since),
-            _midnight(self.until, 1),
+            start_of_day(self.since, zone),
+            start_of_day(self.until, zone, 1),
             self.time,
             self.warned,
         )
-
-
-def _midnight(day: date | None, later: int = 0) -> datetime | None:
-    return None if day is None else datetime.combine(day + timedelta(days=later), time(), UTC)
 
 
 def target_names(session: Session) -> Sequence[str]:
@@ -92,7 +89,8 @@ def get_photographs_page(
 ) -> HTMLResponse:
     """One page of photographs, with the filter form."""
     with runtime.database.reading() as session:
-        groups = list_groups(session, query.filter(session), LISTED + 1, query.before)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        groups = list_groups(session, query.filter(session, zone), LISTED + 1, query.before)
         targets = target_names(session)
     older = query.link(groups[LISTED - 1].mark) if len(groups) > LISTED else None
     return render(

@@ -14,6 +14,7 @@ from service.store.photographs.correction_log import list_corrections
 from service.store.photographs.groups import count_groups, get_group, list_groups
 from service.store.photographs.measurements import EXCLUDED
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
 from service.twin.photographs.display import compare_one
 from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, READ, IdentityDep, RuntimeDep
@@ -74,7 +75,7 @@ def get_review_page(
 ) -> HTMLResponse:
     """A photograph with its verdict and forecast, its place in the queue, and the buttons."""
     with runtime.database.reading() as session:
-        chosen = query.filter(session)
+        chosen = query.filter(session, plant_time_zone(session, runtime.settings.time_zone))
         listed = list_groups(session, chosen, 1, query.before) if query.at is None else []
         group = get_group(session, query.at) if query.at else next(iter(listed), None)
         total, place, following = count_groups(session, chosen), 0, None

@@ -152,7 +152,8 @@ def post_shift_form(
 ) -> HTMLResponse:
     """What an offset would change; nothing is stored."""
     with runtime.database.reading() as session:
-        given = shifted_times(session, form.filter(session), form.minutes, form.reason)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        given = shifted_times(session, form.filter(session, zone), form.minutes, form.reason)
     return _preview(request, runtime, given, "times", form.reason)
 
 

@@ -21,7 +21,7 @@ from tests.service.conftest import (
     properties_document,
     tower_document,
 )
-from tests.service.web.pages import HTML, field_of, form, text_of
+from tests.service.web.pages import HTML, Page, field_of, form, text_of
 
 ZONE = "Europe/Madrid"
 
@@ -71,6 +71,33 @@ def test_forms_say_the_zone(madrid: TestClient, path: str):
     page = text_of(madrid, path)
     assert ZONE in page.one("main").words
     assert not page.all("input", type="datetime-local")
+
+
+@pytest.mark.parametrize("path", ["/photographs", "/photographs/times", "/compare", "/studies/new"])
+def test_days_are_texts_of_the_plants_zone(madrid: TestClient, path: str):
+    page = text_of(madrid, path)
+    assert not page.all("input", type="date")
+    assert ZONE in page.one("main").words
+    wrong = text_of(madrid, f"{path}?until=06/21/2026", 422)
+    assert "until: give a day as 2026-06-21, in the plant's time zone" in wrong.words
+    assert "year" in text_of(madrid, f"{path}?since=9999-12-31", 422)
+
+
+def test_photographs_of_a_day_are_those_of_the_plants(madrid: TestClient):
+    for number, at in ((2, "2024-06-20T21:59:00Z"), (3, "2024-06-20T22:01:00Z")):
+        answer = poster(madrid)(png(number), id=f"10{number}", taken_at=at, heliostat="AB01")
+        assert answer.status_code == 201, answer.text
+    query = "since=2024-06-21&until=2024-06-21"
+    page = text_of(madrid, f"/photographs?{query}")
+    assert "103" in page.words
+    assert "102" not in page.words
+    assert field_of(page, "since") == "2024-06-21"
+    review = text_of(madrid, f"/photographs/review?{query}").words
+    assert "103" in review
+    shifted = {"since": "2024-06-21", "minutes": "1", "reason": "slow clock"}
+    shown = Page(madrid.post("/photographs/times/shift", data=shifted).text).words
+    assert "103" in shown
+    assert "102" not in shown
 
 
 def test_now_and_noon_tomorrow_are_filled_in(madrid: TestClient):

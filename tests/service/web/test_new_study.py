@@ -60,7 +60,7 @@ def test_days_are_those_of_the_plants_zone(client: TestClient, post: Post):
     query = "?images=2&since=2024-06-21&until=2024-06-21"
     assert "Photographs1of 1 heliostat;" in words(client, query)
     assert "at least 4 photographs" in words(client, query)
-    assert "Days in Europe/Berlin" in text_of(client, "/studies/new")
+    assert "A day in Europe/Berlin" in text_of(client, "/studies/new")
     payload = requested(client, since="2024-06-21", until="2024-06-21")
     assert (payload["since"], payload["until"]) == ("2024-06-20T22:00:00Z", "2024-06-21T22:00:00Z")
 
