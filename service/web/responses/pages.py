@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -117,6 +118,24 @@ def _moment(value: datetime | None) -> str | Markup:
     return moment(value, _zone())
 
 
+# Paths of pages in the words of alarms and warnings, which REST answers as they are.
+_PATH = re.compile(r"(?<![\w/])(/(?:photographs|jobs)\b(?:[^\s,;()]*\w)?)")
+
+
+def _linked(text: str) -> Markup:
+    """Text with links instead of the paths of pages."""
+    parts = _PATH.split(text)
+    return Markup("").join(_link(part) if at % 2 else part for at, part in enumerate(parts))
+
+
+def _link(path: str) -> Markup:
+    link = Markup('<a href="{}">{}</a>').format
+    if path.startswith("/photographs?"):
+        review = path.replace("?", "/review?", 1)
+        return link(path, "its photographs") + " (" + link(review, "review them") + ")"
+    return link(path, path.replace("/jobs/", "job "))
+
+
 def _shown(value: Any) -> str:
     """The value of a table's cell as text of the page."""
     match value:
@@ -148,7 +167,7 @@ def _environment() -> Environment:
     made.globals.update(query=_query)
     made.globals.update(plant_zone=_zone)
     made.filters.update(
-        shown=_shown, moment=_moment, form_time=lambda value: form_time(value, _zone())
+        shown=_shown, linked=_linked, moment=_moment, form_time=lambda value: form_time(value, _zone())
     )
     return made
 

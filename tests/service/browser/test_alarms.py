@@ -10,6 +10,16 @@ from tests.service.browser.test_shift import AXE, TOO_WIDE
 from tests.service.conftest import free_port, serving
 from tests.service.storm import CLOCK, UNDATED, make_storm, storm_app
 
+TRUNCATED = """() => [...document.querySelectorAll("select")].filter((one) => {
+  const free = one.cloneNode(true);
+  free.style.cssText = "position: absolute; width: max-content; max-width: none";
+  one.after(free);
+  const is_wider = free.offsetWidth > one.offsetWidth + 1;
+  free.remove();
+  return is_wider;
+}).map((one) => one.name)"""
+"""Names of the selections that are too narrow for their longest option."""
+
 
 @pytest.fixture(scope="module")
 def storm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
@@ -32,6 +42,7 @@ def test_operator_reduces_a_storm_to_its_causes(
 
     def check() -> None:
         assert page.evaluate(TOO_WIDE) <= 0
+        assert page.evaluate(TRUNCATED) == []
         assert violations(page, **AXE) == []
 
     def acknowledge(why: str, words: str = "") -> None:

@@ -41,7 +41,13 @@ def test_storm_is_reduced_to_its_causes(tmp_path: Path):
         assert undated["alerts"] == {"times_unknown": UNDATED}
         page = client.get("/attention", headers=HTML).text
         assert "2 probable causes of 199 alarms, and 1 other" in page
-        assert len(page) < 400_000
+        assert len(page) < 500_000
+        links = r'href="(/photographs(?:/review)?)[?]heliostat=(\S+)&amp;warned=true"'
+        listed, reviewed = re.findall(links, page)[:2]
+        assert (listed[0], reviewed[0]) == ("/photographs", "/photographs/review")
+        for path, name in (listed, reviewed):
+            asked = {"heliostat": name, "warned": True}
+            assert client.get(path, params=asked, headers=HTML).status_code == 200
         # As one on the page, the other over REST.
         token = re.findall(r'name="groups" value="(cause:\S+)"', page)[0]
         form = {"groups": token, "why": "Work is ordered", "words": "the clock is being set"}
