@@ -167,7 +167,10 @@ def _environment() -> Environment:
     made.globals.update(query=_query)
     made.globals.update(plant_zone=_zone)
     made.filters.update(
-        shown=_shown, linked=_linked, moment=_moment, form_time=lambda value: form_time(value, _zone())
+        shown=_shown,
+        linked=_linked,
+        moment=_moment,
+        form_time=lambda value: form_time(value, _zone()),
     )
     return made
 
