@@ -1,5 +1,6 @@
 """Templates of pages and reports, with their formats of numbers and times."""
 
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -78,6 +79,17 @@ def in_zone(zone: str | None) -> Callable[[datetime], str]:
     )
 
 
+_UTC_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d)?( UTC|Z)")
+
+
+def times_in_zone(text: str, zone: str = "UTC") -> str:
+    """A text whose times in UTC, such as ``2026-06-21 11:00 UTC``, are in a ``zone`` instead."""
+    in_text = in_zone(zone)
+    return _UTC_TIME.sub(
+        lambda found: in_text(datetime.fromisoformat(found[0].replace(" UTC", "Z"))), text
+    )
+
+
 def power(watts: float) -> Quantity:
     """A power in W, or in kW from 1000 W."""
     text = figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
@@ -145,6 +157,7 @@ def environment(*packages: str) -> Environment:
         percent=percent,
         moment=moment,
         form_time=form_time,
+        plant_times=times_in_zone,
         power=power,
         irradiance=irradiance,
         lasting=lasting,

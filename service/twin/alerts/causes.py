@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, datetime, timedelta
 from datetime import time as clock
 from statistics import median
 from typing import Literal, NamedTuple
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from sqlalchemy import func, select
@@ -24,6 +25,7 @@ from service.store.tables import (
     SurfaceRow,
 )
 from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.outliers import list_outliers
 from service.twin.plant import model_versions
 from service.twin.surfaces.accuracy import (
@@ -63,7 +65,8 @@ class PhotographFacts:
     """What the store knows of a photograph.
 
     ``accuracy`` [1] is that of the compared forecast, else that of its arrival. ``warnings`` are
-    those of the measurement. ``was_used`` is whether the surface was computed from it.
+    those of the measurement. ``taken_at`` is in the plant's zone. ``was_used`` is whether the
+    surface was computed from it.
     """
 
     identifier: str
@@ -363,10 +366,11 @@ def read_facts(
     compared = {one.measurement.id: one.accuracy for one in comparisons}
     used = photographs_of_surface(surface)
     recent = store.recent_measurements(session, row, _NEWEST)
+    zone = ZoneInfo(plant_time_zone(session, settings.time_zone))
     photographs = [
         PhotographFacts(
             one.identifier,
-            one.taken_at,
+            None if one.taken_at is None else one.taken_at.astimezone(zone),
             tuple(sun_direction(one.sun_azimuth_deg, one.sun_elevation_deg).tolist()),
             compared.get(one.id, one.forecast_accuracy),
             tuple(one.warnings or ()),
@@ -379,7 +383,11 @@ def read_facts(
         settings.attention_accuracy,
         photographs,
         line,
-        {day: found for day in days if (found := _others_on(session, row.id, day)) is not None},
+        {
+            day: found
+            for day in days
+            if (found := _others_on(session, row.id, day, zone)) is not None
+        },
         () if surface is None else tuple(surface.suspicious or ()),
         None if surface is None else surface.sun_span_deg,
         None if surface is None else surface.misfit,
@@ -388,12 +396,12 @@ def read_facts(
     )
 
 
-def _others_on(session: Session, heliostat: int, day: date) -> DayOfOthers | None:
+def _others_on(session: Session, heliostat: int, day: date, zone: ZoneInfo) -> DayOfOthers | None:
     """Compare other heliostats' accuracies on arrival of a day with their usual ones."""
-    begin = datetime.combine(day, clock(), UTC)
+    begin, end = (datetime.combine(day + timedelta(n), clock(), zone) for n in (0, 1))
     row = MeasurementRow
     is_other = (row.heliostat_id != heliostat, row.accepted, row.forecast_accuracy.is_not(None))
-    is_of_day = row.taken_at.between(begin, begin + timedelta(days=1))
+    is_of_day = row.taken_at.between(begin, end)
     query = select(row.heliostat_id, row.forecast_accuracy).where(*is_other, is_of_day)
     found = session.execute(query.limit(_NEWEST)).all()
     if len(found) < _MIN_OTHERS:

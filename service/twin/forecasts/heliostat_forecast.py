@@ -80,7 +80,7 @@ def position_of(session: Session, sun: Sun | SunAt) -> Sun:
     azimuth, elevation = sun_angles_at(sun.at, store.get_plant(session).origin)
     if elevation <= 0:
         raise InvalidInputError(
-            f"at: the sun is {-elevation:.1f}° below the horizon on {sun.at:%Y-%m-%d at %H:%M} UTC;"
+            f"at: the sun is {-elevation:.1f}° below the horizon at {sun.at:%Y-%m-%d %H:%M} UTC;"
             " choose a time of the day"
         )
     return Sun(azimuth_deg=azimuth, elevation_deg=elevation)

@@ -64,10 +64,10 @@ class DriveStep:
 
     @property
     def when(self) -> str:
-        """The days between which it moved, in words."""
+        """The days between which it moved, in words, or the times of one day."""
         first, last = (f"{moment.day} {moment:%B %Y}" for moment in (self.since, self.until))
         if first == last:
-            return f"on {first} between {self.since:%H:%M} and {self.until:%H:%M} UTC"
+            return f"between {self.since:%Y-%m-%d %H:%M} UTC and {self.until:%Y-%m-%d %H:%M} UTC"
         for same in (f" {self.until:%B %Y}", f" {self.until:%Y}"):
             first = first.removesuffix(same)
         return f"between {first} and {last}"

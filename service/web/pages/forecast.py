@@ -33,6 +33,7 @@ from service.base.fields import (
 from service.base.names import NAME
 from service.base.validation_messages import format_validation_error
 from service.drawing import charts
+from service.drawing.templates import times_in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -306,8 +307,14 @@ def post_forecast_form(
 ) -> Response:
     """Compute and store a forecast, and go to its page."""
     with runtime.database.reading() as session:
-        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
-        sun, altitude = position_of(session, form.sun), store.get_plant(session).altitude_m
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        form = form.in_utc(zone)
+        altitude = store.get_plant(session).altitude_m
+        try:
+            sun = position_of(session, form.sun)
+        except InvalidInputError as night:
+            said = times_in_zone(str(night), zone).removeprefix("at: ")
+            raise InvalidInputError(f"moment: {said}") from night
     if len(form.names) != 1:
         return leave_for(request, _ask_for_many(runtime, form, identity))
     asked = ForecastRequest(

@@ -23,7 +23,7 @@ from starlette.types import Scope
 from service.base.arrays import pack
 from service.base.errors import NotFoundError
 from service.drawing.charts import Figure
-from service.drawing.templates import ASSETS, environment, form_time, moment
+from service.drawing.templates import ASSETS, environment, form_time, moment, times_in_zone
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.security import Identity, Role
 from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
@@ -169,6 +169,7 @@ def _environment() -> Environment:
     made.filters.update(
         shown=_shown,
         linked=_linked,
+        plant_times=lambda text: times_in_zone(str(text), _zone()),
         moment=_moment,
         form_time=lambda value: form_time(value, _zone()),
     )
@@ -243,8 +244,10 @@ _MEDIA_TYPES = {"csv": f"{CSV}; charset=utf-8", "npz": "application/x-npz", "png
 
 def _file(content: str | bytes, name: str, suffix: str) -> HTMLResponse:
     """A part of a page as a file. It is an HTMLResponse, because it replaces the page."""
+    # A picture is shown, unless the link to it asks for a download.
+    shown = "inline" if suffix == "png" else "attachment"
     headers = {
-        "Content-Disposition": f'attachment; filename="{name}.{suffix}"',
+        "Content-Disposition": f'{shown}; filename="{name}.{suffix}"',
         "Cache-Control": "private, no-cache",
     }
     return HTMLResponse(content, media_type=_MEDIA_TYPES[suffix], headers=headers)

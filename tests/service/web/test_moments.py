@@ -1,5 +1,6 @@
 """Forms: times in the plant's time zone, several heliostats, and corrections without a change."""
 
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -9,7 +10,7 @@ from fastapi.testclient import TestClient
 
 from service.base.fields import plant_time_to_utc
 from service.base.settings import Settings
-from service.drawing.templates import form_time
+from service.drawing.templates import form_time, times_in_zone
 from service.store.columns import now
 from service.web.app import create_app
 from tests.service.conftest import (
@@ -64,6 +65,21 @@ def test_wrong_time_names_the_field_and_the_remedy(madrid: TestClient):
     answer = madrid.post("/forecast", data=form(sun_by="time", moment="06/21/2026 1 pm"))
     assert answer.status_code == 422
     assert "moment: give a date and a time as 2026-06-21 13:00, in the plant" in answer.text
+
+
+def test_night_is_said_in_the_plants_time(madrid: TestClient):
+    answer = madrid.post("/forecast", data=form(sun_by="time", moment="2026-06-21 23:30"))
+    assert answer.status_code == 422
+    assert re.search(r"moment: the sun is .* at 2026-06-21 23:30 CEST", answer.text)
+    body = {"heliostat": "AA39", "target": "upper", "sun": {"at": "2026-06-21T21:30:00Z"}}
+    assert "at 2026-06-21 21:30 UTC" in madrid.post("/v1/forecasts", json=body).text
+
+
+def test_times_in_texts_are_moved():
+    said = "between 2024-08-12 09:05 UTC and 2024-08-12T11:10:07Z, after 2024-01-12 23:10 UTC"
+    moved = "between 2024-08-12 11:05 CEST and 2024-08-12 13:10 CEST, after 2024-01-13 00:10 CET"
+    assert times_in_zone(said, ZONE) == moved
+    assert times_in_zone(said.replace("T11:10:07Z", " 11:10 UTC"), "UTC").count("UTC") == 3
 
 
 @pytest.mark.parametrize("path", ["/forecast", "/plans", "/calibration-plan"])

@@ -88,7 +88,8 @@ def test_every_table_and_figure_is_a_file(shown: TestClient):
 
 def check(answer: Any) -> None:
     """A file of its kind."""
-    assert answer.headers["Content-Disposition"].startswith("attachment; filename=")
+    shown, _, _ = answer.headers["Content-Disposition"].partition("; filename=")
+    assert (shown == "inline") == (answer.headers["Content-Type"] == "image/png")
     match answer.headers["Content-Type"]:
         case "text/csv; charset=utf-8":
             head, *rows = csv.reader(io.StringIO(answer.text, newline=""))

@@ -165,7 +165,7 @@ def test_a_mount_that_fits_no_more_has_no_pointing_error(
         (
             (2024, 8, 12, 9, 5),
             (2024, 8, 12, 11, 10),
-            "on 12 August 2024 between 09:05 and 11:10 UTC",
+            "between 2024-08-12 09:05 UTC and 2024-08-12 11:10 UTC",
         ),
     ],
 )
