@@ -63,7 +63,11 @@ def accuracy_over_time(series: Mapping[str, Sequence[Value]], settings: Settings
 def pointing_over_time(series: Mapping[str, Sequence[Value]], settings: Settings) -> OverTime:
     """Pointing errors, with the limit of alerts."""
     return OverTime(
-        "Pointing error of photographs that the mount was calibrated from", "mrad", series, 2, Threshold(settings.attention_pointing_mrad)
+        "Pointing error of photographs that the mount was calibrated from",
+        "mrad",
+        series,
+        2,
+        Threshold(settings.attention_pointing_mrad),
     )
 
 

@@ -227,7 +227,9 @@ def test_form_leads_to_the_plan_which_can_be_reopened(app: FastAPI, two_heliosta
     assert f'<a href="{path}">June</a>' in text_of(two_heliostats, "/plans")
     assert "2026-06-21 06:00 UTC</time></h2>" in text_of(two_heliostats, f"{path}?at=1")
     assert "2026-06-21 10:00 UTC</time></h2>" in text_of(two_heliostats, f"{path}?at=99")
-    assert f'href="{path}">Open plan “June”</a>' in text_of(two_heliostats, path.replace("plans", "jobs"))
+    assert f'href="{path}">Open plan “June”</a>' in text_of(
+        two_heliostats, path.replace("plans", "jobs")
+    )
 
 
 @pytest.mark.parametrize(
