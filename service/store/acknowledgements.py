@@ -171,6 +171,16 @@ def list_batches(
     ]
 
 
+def newest_batch(session: Session, heliostat: str, reason: str) -> AcknowledgementBatch | None:
+    """The newest batch with an alert of this reason that was not undone; None without one."""
+    numbers = [
+        row.batch
+        for key, row in acknowledged(session).items()
+        if key[:2] == (heliostat, reason) and row.batch is not None
+    ]
+    return list_batches(session, 1, number=max(numbers))[0] if numbers else None
+
+
 # --- history
 # --------------------------------------------------------------------------------------------------
 

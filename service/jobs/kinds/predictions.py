@@ -11,7 +11,7 @@ from model.progress import Progress
 from service import store
 from service.base.choices import require_images
 from service.base.errors import SKIPPED
-from service.base.fields import Method, Model, ModelVersion, Whole
+from service.base.fields import Method, Model, ModelVersion, Moment, Whole
 from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.sources.documents import read_heliostat
@@ -21,6 +21,7 @@ from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import (
     READING,
     STORING,
+    MeasurementChoice,
     StoredSurface,
     compute_surface,
     keep_surface,
@@ -48,6 +49,9 @@ class PredictionsIn(Model):
         ge=1,
         le=64,
         description="How many measurements to take of each heliostat; 8 the network.",
+    )
+    since: Moment | None = Field(
+        default=None, description="Only measurements taken since then; null: all."
     )
     model_version: ModelVersion = None
 
@@ -132,7 +136,7 @@ def _predict_step(
             context.runtime,
             name,
             payload.method,
-            images=payload.images,
+            MeasurementChoice(payload.images, payload.since),
             model_version=model_version,
             progress=progress,
         )

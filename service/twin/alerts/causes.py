@@ -35,10 +35,13 @@ from service.twin.surfaces.accuracy import (
     rank_of,
 )
 
-CauseKind = Literal["clock", "foreign_light", "haze", "moved", "few_suns", "model", "times_unknown"]
+CauseKind = Literal[
+    "clock", "mirror", "foreign_light", "haze", "moved", "few_suns", "model", "times_unknown"
+]
 
 CAUSES: dict[CauseKind, str] = {
     "clock": "Wrong sun or clock",
+    "mirror": "The mirror changed",
     "foreign_light": "Another heliostat's light, a shadow or a cloud",
     "haze": "Haze, or the camera",
     "moved": "It moved",
@@ -88,6 +91,14 @@ class StudyFinding(NamedTuple):
     said: str
 
 
+class Fall(NamedTuple):
+    """A surely lower accuracy [1] since a photograph: the median of the newest, and before."""
+
+    since: datetime
+    recent: float
+    earlier: float
+
+
 @dataclass(frozen=True)
 class DayOfOthers:
     """Photographs of other heliostats on a day: number, heliostats, accuracy [1], usual one [1]."""
@@ -115,6 +126,17 @@ class HeliostatFacts:
     misfit: float | None = None
     usual_misfit: float | None = None
     study: StudyFinding | None = None
+    fall: Fall | None = None
+
+    def since_fall(self) -> list[PhotographFacts]:
+        """Photographs since the accuracy fell, unless that of other heliostats fell then, too."""
+        if self.fall is None:
+            return []
+        since = self.fall.since
+        found = [one for one in self.photographs if one.taken_at and one.taken_at >= since]
+        days = {one.taken_at.date() for one in found if one.taken_at} & self.others.keys()
+        fell = [self.others[day].usual - self.others[day].accuracy >= _DROP for day in days]
+        return [] if fell and 2 * sum(fell) >= len(fell) else found
 
 
 @dataclass(frozen=True)
@@ -123,7 +145,7 @@ class LikelyCause:
 
     ``share`` [1] is the share of the poor photographs that the evidence concerns; for causes that
     concern all of them, the share of the shortfall that it explains. ``photographs`` are
-    identifiers, ``day`` and ``study`` where to look.
+    identifiers, ``day`` and ``study`` where to look, ``since`` when it began.
     """
 
     kind: CauseKind
@@ -131,6 +153,7 @@ class LikelyCause:
     evidence: str
     photographs: tuple[str, ...] = ()
     day: date | None = None
+    since: datetime | None = None
     study: int | None = None
 
     @property
@@ -185,6 +208,7 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
     poor = outlier_reasons(facts)
     found = [
         *_clock(facts, poor),
+        *_mirror(facts, poor),
         *_foreign_light(facts, poor),
         *_haze(facts, poor),
         *_moved(facts, poor),
@@ -217,6 +241,30 @@ def _clock(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
     return _of_photographs("clock", wrong, poor, said)
 
 
+def _mirror(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
+    """An accuracy that fell at a date, when that of others did not."""
+    since = facts.since_fall()
+    if facts.fall is None or not since:
+        return []
+    others = [
+        facts.others[d]
+        for d in {one.taken_at.date() for one in since if one.taken_at}
+        if d in facts.others
+    ]
+    kept = (
+        f"{sum(one.photographs for one in others)} photographs of others kept theirs"
+        if others
+        else "no photographs of others then to compare"
+    )
+    said = (
+        f"its forecasts are surely worse since {facts.fall.since:%Y-%m-%d}:"
+        f" {percent(facts.fall.earlier)} before, {percent(facts.fall.recent)} in the median; {kept}"
+    )
+    names = tuple(one.identifier for one in since)
+    share = max(0.5, len(set(names) & poor.keys()) / max(len(poor), 1))
+    return [LikelyCause("mirror", share, said, names, since=facts.fall.since)]
+
+
 def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
     """Photographs that contradict the others, without a contradicting time or a day of haze."""
     unlike = [one for one in facts.photographs if one.warning(UNLIKE_HELIOSTAT)]
@@ -227,11 +275,12 @@ def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[Likel
             f" {len(facts.photographs)} much better"
         )
         return _of_photographs("foreign_light", unlike, poor, said)
-    days = set(_hazy_days(facts, poor))
+    days, changed = set(_hazy_days(facts, poor)), facts.since_fall()
     apart = [
         one
         for one in facts.photographs
         if one.identifier in poor
+        and one not in changed
         and one.warning(SUN_CONTRADICTS_TIME) is None
         and (one.taken_at is None or one.taken_at.date() not in days)
     ]
@@ -379,6 +428,7 @@ def read_facts(
         for one in recent
     ]
     days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
+    drift, allowed = session.get(DriftRow, row.id), settings.attention_accuracy_drop
     return HeliostatFacts(
         settings.attention_accuracy,
         photographs,
@@ -393,6 +443,9 @@ def read_facts(
         None if surface is None else surface.misfit,
         _usual_misfit(session),
         _study(session, row.name),
+        Fall(drift.fell_since or drift.taken_at, drift.recent or 0.0, drift.earlier or 0.0)
+        if drift is not None and (drift.min_drop or 0) > allowed
+        else None,
     )
 
 
@@ -453,7 +506,7 @@ def is_poor(
     return bool(
         (accuracy is not None and accuracy < settings.attention_accuracy)
         or (drift is not None and drift.accuracy < settings.attention_accuracy)
-        or (drift is not None and (drift.min_drop or 0) > settings.attention_accuracy_drop)
+        or facts.fall is not None
         or (shown is not None and shown.warnings and shown.acknowledged_by is None)
         or (pointing is not None and pointing.beyond_since is not None)
         or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)

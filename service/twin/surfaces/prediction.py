@@ -5,6 +5,8 @@ The computation runs outside any transaction. The result is stored in the caller
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import NamedTuple
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -62,16 +64,22 @@ class Predicted:
     judgement: Evaluation | None = None
 
 
+class MeasurementChoice(NamedTuple):
+    """How many accepted measurements to choose, of those taken since a time if it is given."""
+
+    images: int = 8
+    since: datetime | None = None
+
+
 def compute_surface(
     runtime: Runtime,
     heliostat: str,
     method: Method = "network",
-    measurements: Sequence[str] | None = None,
-    images: int = 8,
+    measurements: Sequence[str] | MeasurementChoice = MeasurementChoice(),
     model_version: int | None = None,
     progress: Progress = silent,
 ) -> Predicted:
-    """Predict a heliostat's surface from named measurements, or from up to ``images`` chosen ones.
+    """Predict a heliostat's surface from named measurements, or from chosen ones.
 
     ``model_version`` is a version of the plant's model, by default the current one. ``progress``
     receives the progress. An exception that it raises stops the prediction.
@@ -83,21 +91,21 @@ def compute_surface(
     InvalidInputError
         If there are more images than the method accepts.
     """
-    require_images(method, images if measurements is None else len(measurements))
+    choice = measurements if isinstance(measurements, MeasurementChoice) else None
+    require_images(method, len(measurements) if choice is None else choice.images)
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat, model_version)
-        names = measurements
-        if names is None:
-            names = [
-                row.identifier
-                for row in choose_measurements(session, twin.row, images, spare=_SPARE)
-            ]
+        if choice is not None:
+            chosen = choose_measurements(session, twin.row, *choice, spare=_SPARE)
+            names = [row.identifier for row in chosen]
+        else:
+            names = [str(one) for one in measurements]
         rows = named_measurements(session, twin.row, names)
         today = store.find_surface_at(session, twin.row)
     with runtime.computing(f"predict_{method}") as operations:
-        if measurements is None:
+        if choice is not None:
             progress(READING, 0, len(rows))
-            observations, _ = choose_observations(operations, twin, rows, images)
+            observations, _ = choose_observations(operations, twin, rows, choice.images)
             progress(READING, len(rows), len(rows))
         else:
             observations = to_observations(
@@ -267,6 +275,7 @@ def predict_surface(
     model_version: int | None = None,
 ) -> StoredSurface:
     """Run `compute_surface`, then `keep_surface` in a separate transaction."""
-    predicted = compute_surface(runtime, heliostat, method, measurements, images, model_version)
+    chosen = MeasurementChoice(images) if measurements is None else measurements
+    predicted = compute_surface(runtime, heliostat, method, chosen, model_version)
     with runtime.database.writing() as session:
         return keep_surface(session, predicted, actor)

@@ -212,11 +212,14 @@ def post_undo_form(
     count: AttentionCountDep,
     identity: IdentityDep,
     page: Annotated[Literal["attention", "history"], Query()] = "attention",
+    heliostat: Annotated[Name | None, Query()] = None,
 ) -> Response:
     """Undo an acknowledgement, and return to the page."""
     undo_acknowledgement(runtime, number, identity.name)
     count.forget()
     count.read()
+    if heliostat is not None:
+        return go_to(f"/heliostats/{heliostat}#warnings-title")
     return go_to("/attention" if page == "attention" else "/attention/history")
 
 

@@ -26,6 +26,8 @@ from service.drawing.charts import HeatMap, History, Scale
 from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Timeline
+from service.store import acknowledgements
+from service.store.acknowledgements import AcknowledgementBatch
 from service.store.photographs.groups import (
     PhotographFilter,
     PhotographGroup,
@@ -312,6 +314,7 @@ class _HeliostatData:
     evidence: OutlierEvidence | None
     exclusions: list[Exclusion]
     choice: Choice | None
+    acknowledgement: AcknowledgementBatch | None
 
 
 def _read(
@@ -341,6 +344,7 @@ def _read(
         )
         mount = mounts.find_mount_at(session, row)
         exclusions = newest_exclusions(session, row)
+        seen = acknowledgements.newest_batch(session, name, "untrusted")
         choice = find_choice(session, surfaces, today, candidate)
         shown, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
         zone = plant_time_zone(session, runtime.settings.time_zone)
@@ -373,6 +377,7 @@ def _read(
         evidence,
         exclusions,
         choice,
+        seen,
     )
 
 
@@ -428,6 +433,7 @@ def get_heliostat_page(
         evidence=read.evidence,
         exclusions=read.exclusions,
         choice=read.choice,
+        acknowledgement=read.acknowledgement,
         choice_maps=None if read.choice is None else _choice_maps(read, read.choice, ends),
         pointing=None if read.mount is None else _mount_context(read.mount),
         **(

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse
 from pydantic import model_validator
 
 from service import store
-from service.base.fields import FormMoment, Method, Model, Name, Text, drop_empty_fields
+from service.base.fields import FormMoment, Method, Model, Moment, Name, Text, drop_empty_fields
 from service.jobs.costs import calibration_cost, import_cost, prediction_cost
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import calibrations, imports, predictions
@@ -25,11 +25,15 @@ _MOST_FOLDERS = 200
 
 
 class StartQuery(Model):
-    """What the page computes costs of: one ``heliostat`` or all, a method, and a folder."""
+    """What the page computes costs of: one ``heliostat`` or all, a method, and a folder.
+
+    Predictions take photographs since ``since``.
+    """
 
     heliostat: Name | None = None
     method: Method = "refined"
     folder: Text | None = None
+    since: Moment | None = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
@@ -84,7 +88,7 @@ def post_predictions_form(
     form: Annotated[StartQuery, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Enqueue predictions, and go to the page of the job."""
-    payload = PredictionsIn(heliostats=form.heliostats, method=form.method)
+    payload = PredictionsIn(heliostats=form.heliostats, method=form.method, since=form.since)
     return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
 
 

@@ -194,6 +194,17 @@ def test_accuracy_that_fell_above_the_least(tmp_path: Path):
         assert item["reason"] == "fell"
         assert "with an accuracy of 81% in the median when they came, 96% before" in item["message"]
         assert "Accuracy fell" in client.get("/attention", headers=HTML).text
+        # The heliostat's page ranks it first, with a prediction from photographs since then.
+        page = client.get("/heliostats/AA39", headers=HTML).text
+        (first, *_) = re.findall(r"<strong>(.*?)</strong>.*?: (.*)", page[page.index("causes") :])
+        assert first[0] == "The mirror changed"
+        assert re.search(r"96\.0\s%\sbefore, 81\.0\s%\sin the median", first[1])
+        (since,) = re.findall(r'name="since" value="(.*?)"', page)
+        assert datetime.fromisoformat(since) == datetime.fromisoformat(item["since"])
+        form = {"heliostat": "AA39", "since": since}
+        job = client.post("/jobs/predictions", data=form, headers=HTML, follow_redirects=False)
+        payload = client.get(f"/v1{job.headers['location']}").json()["payload"]
+        assert datetime.fromisoformat(payload["since"]) == datetime.fromisoformat(since)
         # A photograph that was excluded says nothing of the mirror.
         for number in range(15, 20):
             path = f"/v1/heliostats/AA39/measurements/{number}"

@@ -102,10 +102,18 @@ def test_warnings_are_shown_with_reasons_and_time(client: TestClient):
 
 def test_acknowledgement_holds_while_the_warnings_are_the_same(client: TestClient):
     first = predict(client, "network", "1", "2")
-    seen = client.post(
-        "/heliostats/AA39/surfaces/1/acknowledge", headers=HTML, follow_redirects=False
-    )
-    assert seen.status_code == 303
+    path = "/heliostats/AA39/surfaces/1/acknowledge"
+    assert client.post(path, headers=HTML, follow_redirects=False).status_code == 422
+    for is_first in (True, False):  # it is undone once
+        page = client.post(path, data={"reason": "dew on it"}, headers=HTML).text
+        assert re.search(r"Acknowledged by local, .*: dew on it\.", page)
+        (undo,) = re.findall(r'action="(/attention/acknowledgements/.*?)"', page)
+        (item,) = client.get("/v1/attention?reason=untrusted").json()["items"]
+        assert item["acknowledged_reason"] == "dew on it"
+        if is_first:
+            page = client.post(undo.replace("&amp;", "&"), headers=HTML).text
+            assert "<h1>Heliostat AA39</h1>" in page
+            assert client.get(f"{BASE}/1").json()["acknowledged_by"] is None
     kept = client.get(f"{BASE}/1").json()
     assert kept["acknowledged_by"] == "local"
     assert (
