@@ -37,7 +37,7 @@ def _preview(client: TestClient, lines: str, **files: Any) -> Any:
 
 
 def test_times_are_previewed_stored_and_undone(client: TestClient, taken: list[dict[str, Any]]):
-    assert "3\xa0photographs of 1\xa0heliostats" in text_of(client, PATH).words
+    assert "3\xa0photographs of 1 heliostat have no time" in text_of(client, PATH).words
     lines = "\n".join(f"AA39,{one['id']},{one['taken_at'][:-1]}" for one in taken)
     preview = _preview(client, lines)
     assert preview.status_code == 200, preview.text
