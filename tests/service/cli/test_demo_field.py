@@ -17,6 +17,7 @@ from service.store.tables import HeliostatRow, MeasurementRow
 from tests.conftest import made_once
 from tests.service.conftest import until
 from tests.service.real import client_on, runtime_of
+from tests.service.twin.test_causes import causes_of
 
 ROWS = 4
 """Rows of heliostats: those with faults are in them."""
@@ -45,6 +46,20 @@ def alerts_of(client: TestClient) -> list[dict[str, Any]]:
 def test_faults_of_heliostats_raise_their_alarms(client: TestClient, fault: Fault):
     found = {one["heliostat"] for one in alerts_of(client) if one["reason"] == fault.alarm}
     assert found == set(fault.heliostats)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "cause"), [("drives stepped", "It moved"), ("facet canted", "The mirror changed")]
+)
+def test_the_card_of_a_heliostat_ranks_its_fault(client: TestClient, kind: str, cause: str):
+    alerts_of(client)
+    (name,) = next(fault.heliostats for fault in FAULTS if fault.kind == kind)
+    first, model = causes_of(client, name)
+    assert first.startswith(cause)
+    # The study of the hazy days included it, and found what the model lacks.
+    assert model.startswith("The model lacks something")
+    assert "study 1 of its photographs" in model
 
 
 @pytest.mark.slow
