@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+import time
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
@@ -24,6 +25,8 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.folder import MeasurementFolder, read_folder
+from service.store.job_tables import JobRow
+from service.store.jobs import queue
 from service.twin.photographs.repeats import receive
 from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.importing import import_folder
@@ -32,6 +35,7 @@ ACTOR = "demo"
 """Who the store says made its jobs and sent its photographs."""
 
 _THREADS = 2
+_POLL_S = 0.1
 _EVERY = 4  # of the heliostats without an alarm, every fourth has a predicted surface
 _LIMIT_W_M2 = 4e5  # of the receiver
 
@@ -109,10 +113,20 @@ def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> No
 
 
 def _run(runtime: Runtime, job: str, **payload: Any) -> None:
-    """Queue a job, and run it."""
+    """Queue a job, and work until it is done, also if an attempt fails and another one follows."""
     kind = KINDS[job]
-    enqueue(runtime, kind, kind.payload.model_validate(payload), ACTOR)
-    Worker(runtime, KINDS, ACTOR, threading.Event()).work()
+    number = enqueue(runtime, kind, kind.payload.model_validate(payload), ACTOR).id
+    worker = Worker(runtime, KINDS, ACTOR, threading.Event())
+    while (row := _read_job(runtime, number)).state not in queue.ENDED:
+        if not worker.work():
+            time.sleep(_POLL_S)
+    if row.state != "done":
+        raise RuntimeError(f"job {number} ({job}) {row.state}: {row.reason}")
+
+
+def _read_job(runtime: Runtime, number: int) -> JobRow:
+    with runtime.database.reading() as session:
+        return queue.get_job(session, number)
 
 
 def _receive(
