@@ -129,10 +129,13 @@ def test_what_is_not_trusted_nor_judged_says_so(seen: Any):
     follow(seen, "tbody th a")
     expect(seen.locator("#warnings-title")).to_contain_text("not trusted since")
     expect(seen.locator(".tiles")).to_contain_text("not yet evaluated")
-    button = "section:has(#warnings-title) button"
-    if seen.locator(button).count():
-        follow(seen, button)
-    expect(seen.locator("section:has(#warnings-title)")).to_contain_text("Acknowledged by local")
+    card = seen.locator("section:has(#warnings-title)")
+    seen.fill("section:has(#warnings-title) [name=reason]", "a mirror of the old type")
+    follow(seen, "section:has(#warnings-title) button")
+    expect(card).to_contain_text("Acknowledged by local")
+    expect(card).to_contain_text("a mirror of the old type")
+    follow(seen, "section:has(#warnings-title) >> text=Undo")
+    expect(card).not_to_contain_text("Acknowledged")
 
 
 @SIZES
