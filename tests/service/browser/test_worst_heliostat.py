@@ -19,7 +19,7 @@ VEILED = ("217678", "218385")
 LIMIT = 0.91
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def served(stj: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The service, with the real model and a worker, on a store imported from a folder.
 
@@ -67,18 +67,21 @@ class Clicks:
 
 
 def check(page: Any) -> None:
-    """The page has no fault of axe-core and does not scroll sideways, at a desk and on a phone."""
-    for size, scheme in ((DESK, "light"), (PHONE, "dark")):
-        page.set_viewport_size(size)
-        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
-        assert violations(page, **AXE) == [], (page.url, scheme)
-        assert page.evaluate(TOO_WIDE) <= 0, page.url
-    assert page.evaluate(LOW) == [], page.url
-    page.set_viewport_size(DESK)
-    page.emulate_media(color_scheme="light")
+    """The page has no fault of axe-core, does not scroll sideways, and meets a finger."""
+    assert violations(page, **AXE) == [], page.url
+    assert page.evaluate(TOO_WIDE) <= 0, page.url
+    if page.viewport_size == PHONE:
+        assert page.evaluate(LOW) == [], page.url
 
 
-def test_worst_heliostat_gets_a_promoted_surface_in_six_clicks(page: Any):
+@pytest.mark.parametrize(
+    ("size", "scheme"), [(DESK, "light"), (PHONE, "dark")], ids=["desk-light", "phone-dark"]
+)
+def test_worst_heliostat_gets_a_promoted_surface_in_six_clicks(
+    page: Any, size: dict[str, int], scheme: str
+):
+    page.set_viewport_size(size)
+    page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
     clicks = Clicks(page)
     page.goto("/")
     worst = "dl.tiles small a[href='/heliostats/AA39']"
