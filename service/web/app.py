@@ -121,6 +121,7 @@ def create_app(
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)
+                await to_thread.run_sync(app.state.attention.close)
                 await to_thread.run_sync(app.state.field.close)
                 await to_thread.run_sync(app.state.comparisons.close)
         finally:

@@ -9,10 +9,13 @@ from service.twin.alerts.acknowledging import record_history
 from service.twin.alerts.alerts import list_alerts
 from service.twin.alerts.field_overview import FieldOverviewCache
 from service.twin.alerts.reasons import SEVERITIES, Severity
+from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
 
 # Longest time that the count in the pages' menu is reused [s].
 _COUNT_HOLDS_S = 15.0
+# Longest time that the home page of a large field waits for a count [s].
+_QUICK_S = 0.3
 
 
 class AlertCount:
@@ -26,6 +29,29 @@ class AlertCount:
         self._lock = threading.Lock()
         self._counted: dict[Severity, int] = dict.fromkeys(SEVERITIES, 0)
         self._counted_s = -math.inf
+        self._number = 0  # of counts so far
+        self._background: BackgroundCache[int, dict[Severity, int] | None] = BackgroundCache(
+            lambda _: self.by_severity(), None, "alerts", 1
+        )
+
+    def close(self) -> None:
+        """Stop the background work."""
+        self._background.close()
+
+    def at_once(self) -> dict[Severity, int] | None:
+        """The numbers of the last count, for a large field; None before the first.
+
+        Another count that is due begins in the background, and is waited for briefly.
+        """
+        if not self._number:
+            return None
+        if time.monotonic() - self._counted_s >= _COUNT_HOLDS_S:
+            self.begin(_QUICK_S)
+        return dict(self._counted)
+
+    def begin(self, seconds: float = 0.0) -> None:
+        """Begin a count in the background, and wait for it at most ``seconds``."""
+        self._background.wait_for(self._number, seconds)
 
     def by_severity(self) -> dict[Severity, int]:
         """The number of open alerts of each severity, at most some seconds old."""
@@ -39,6 +65,7 @@ class AlertCount:
                 )
                 self._counted = {severity: counted[severity] for severity in SEVERITIES}
                 self._counted_s = time.monotonic()
+                self._number += 1
             return dict(self._counted)
 
     def read(self) -> int:

@@ -396,12 +396,17 @@ class FieldOverviewCache:
         for cache in (self._readings, self._figures, self._accuracies, self._pointing):
             cache.close()
 
+    @property
+    def is_large(self) -> bool:
+        """Whether a page does not wait for results of all heliostats."""
+        return self._last is not None and self._last.count > _LARGE
+
     def recent(self, session: Session, key: Hashable, compute: Callable[[], Result]) -> Result:
         """The result of ``compute``, or for a large field a recent one.
 
         A recent result is used only if nothing was stored since.
         """
-        if self._last is None or self._last.count <= _LARGE:
+        if not self.is_large:
             return compute()
         return self._recent.get((_cache_marks(session), key), compute)
 

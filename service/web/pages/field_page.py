@@ -12,6 +12,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from pydantic import Field
+from starlette.background import BackgroundTask
 
 from service import store
 from service.base.fields import Search
@@ -311,12 +312,13 @@ def get_field(
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED
     scale = scale_for(chosen, runtime.settings)
-    return render(
+    alarms = count.at_once() if cache.is_large else count.by_severity()
+    page = render(
         request,
         "field.html",
         plant=None if plant is None else plant.name,
         in_zone=in_zone(zone),
-        alarms=count.by_severity(),
+        alarms=alarms,
         severities=SEVERITIES,
         accuracy=field_accuracy(lines, limit),
         limit=limit,
@@ -345,3 +347,6 @@ def get_field(
         # more heliostats are pending.
         again_ms=min(max(1500, 30 * now.pending), 15_000) if now.pending or now.is_behind else None,
     )
+    if alarms is None:  # the first count of a large field takes seconds
+        page.background = BackgroundTask(count.begin)
+    return page
