@@ -27,6 +27,7 @@ from service.jobs.worker import Worker
 from service.sources.paint_documents import azimuth_from_north
 from service.store import keys
 from service.web.app import create_app
+from tests.service.archives import zipped
 
 FILE = Path(__file__).parents[1] / "service" / "web" / "examples.json"
 KEY = "the-key-of-the-calibration-system"
@@ -37,6 +38,8 @@ CAMERA = {"transfer": {"gamma": 1.5}}
 """What the plant declares of its camera. The photographs have sRGB, so a study finds the rest."""
 
 TIME = re.compile(r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}(\.\d+)?(Z|\+00:00)?")
+RANDOM = re.compile(r"-[0-9a-f]{16}(?![0-9a-f])")
+"""Of the name of an upload."""
 MAX_TEXT = 1000
 PLACES = ("coordinates", "corners", "heliostat_position", "origin_wgs84")
 
@@ -63,6 +66,7 @@ def shorten(value: Any, secrets: Mapping[str, str], since: datetime, place: str 
         for secret, name in secrets.items():
             value = value.replace(secret, name)
         value = TIME.sub(lambda found: _fixed(found[0], since), value)
+        value = RANDOM.sub("-4b1f6c3a9d02e875", value)
         return value if len(value) <= MAX_TEXT else value[:MAX_TEXT].rsplit("\n", 1)[0] + "\n..."
     return value
 
@@ -239,6 +243,9 @@ def predict(record: Recorder, root: Path) -> None:
     path = "/v1/heliostats/AB12/surfaces"
     record.run("post_predictions_job", "/v1/jobs/predictions", images=4)
     record.run("post_imports_job", "/v1/jobs/imports", folder="plant")
+    sent = {"file": ("plant.zip", zipped(root), "application/zip")}
+    record.call("post_import_upload", "POST /v1/jobs/imports/uploads", 201, files=sent)
+    record.examples["post_import_upload"]["body"] = {"file": "plant.zip"}
     active = record.client.get(f"{path}/current").json()["version"]
     choice = {"version": 1 if active > 1 else 2, "reason": "measured before it was canted again"}
     record.call("put_current_surface", f"PUT {path}/current", json=choice)

@@ -184,6 +184,11 @@ class StorageSettings(_SettingsGroup):
         return url if self.password is None else url.set(password=self.password.get_secret_value())
 
     @property
+    def uploads_dir(self) -> Path:
+        """Folder of uploaded measurement folders, until they are imported."""
+        return self.data_dir / "uploads"
+
+    @property
     def migrates_on_start(self) -> bool:
         """Whether the service migrates the schema at start.
 
@@ -277,9 +282,12 @@ class LimitSettings(_SettingsGroup):
     max_uploads_of_key: int = Field(32, ge=1, le=10_000)
     """Photographs that one key may be sending at a time; 429 beyond."""
     max_body_bytes_of_key: int = Field(256 * 2**20, ge=1024)
-    """Bytes of bodies of one key that are not answered yet; 429 beyond."""
+    """Bytes of bodies of one key that are not answered yet; 429 beyond. Also the largest ZIP file
+    of a measurement folder."""
     max_body_bytes: int = Field(768 * 2**20, ge=1024)
     """Those of all keys, which the temporary folder must hold; 503 beyond."""
+    max_unpacked_bytes: int = Field(2 * 2**30, ge=1024)
+    """Largest measurement folder in a ZIP file, unpacked [bytes]."""
     min_bytes_per_s: float = Field(4096.0, gt=0, le=1e9)
     """Bytes of a body that must come each second, on the whole [bytes/s]."""
 

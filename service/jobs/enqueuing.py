@@ -2,6 +2,7 @@
 
 from service.jobs.common import require_stored
 from service.jobs.kind import Kind, Kinds, Payload
+from service.jobs.uploads import delete_unused_uploads
 from service.store import audit
 from service.store.job_tables import JobRow
 from service.store.jobs.queue import Bounds, add_job, cancel, delete_plan
@@ -72,4 +73,5 @@ def cancel_for(runtime: Runtime, number: int, actor: str) -> JobRow:
     with runtime.database.writing() as session:
         row = cancel(session, number)
         audit.record(session, actor, "job.cancelled", f"job {number}", kind=row.kind)
-        return row
+    delete_unused_uploads(runtime)
+    return row

@@ -27,6 +27,7 @@ from service.base.settings import Settings
 from service.jobs.enqueuing import enqueue_due
 from service.jobs.heartbeat import heartbeat
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
+from service.jobs.uploads import delete_unused_uploads
 from service.store import record_retention
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
@@ -77,6 +78,7 @@ def _delete_old_records(runtime: Runtime) -> int:
             if count:
                 logger.info("%d %s deleted that were older than %g days", count, records, days)
             deleted += count
+    delete_unused_uploads(runtime)
     return deleted
 
 
@@ -91,7 +93,6 @@ def _store(context: Context, write: Callable[[Session], None]) -> None:
         try:
             with runtime.database.writing() as session:
                 write(session)
-            return
         except OperationalError as error:
             logger.error("the end of job %d is not stored yet: %s", lease.job_id, error)
         # The database does not accept the result.
@@ -100,6 +101,9 @@ def _store(context: Context, write: Callable[[Session], None]) -> None:
             if write is not failed:
                 write = failed
                 continue
+        else:
+            delete_unused_uploads(runtime)
+            return
         if context.lost.is_set() or context.stopping.wait(runtime.settings.job_poll_s):
             return  # the lease expires, and another worker repeats the job
 

@@ -29,7 +29,7 @@ from service.base.settings import Settings
 from service.twin.runtime.slots import STOPPING
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter, HeldBody, JsonShape
-from service.web.auth.dependencies import takes_upload
+from service.web.auth.dependencies import takes_archive, takes_upload
 from service.web.auth.rate_limiter import RateLimiter, sender_of
 from service.web.responses import pages, problems
 from service.web.responses.fragments import take_part
@@ -410,7 +410,8 @@ class BodyLimitMiddleware:
         """Largest body of this kind that any route accepts [bytes]."""
         if security.is_public(scope["path"]):
             return _PUBLIC_BYTES
-        return self.largest_upload if _is_upload(headers) else self.settings.max_json_bytes
+        settings = self.settings
+        return settings.max_body_bytes_of_key if _is_upload(headers) else settings.max_json_bytes
 
     @property
     def largest_upload(self) -> int:
@@ -474,7 +475,9 @@ class _BoundedBody:
         takes_file, settings = takes_upload(route), self._bounds.settings
         is_public = security.is_public(self._scope["path"])
         rest = _PUBLIC_BYTES if is_public else settings.max_json_bytes
-        self._limit = self._bounds.largest_upload if takes_file and _is_upload(headers) else rest
+        photograph, archive = self._bounds.largest_upload, settings.max_body_bytes_of_key
+        largest = archive if takes_archive(route) else photograph
+        self._limit = largest if takes_file and _is_upload(headers) else rest
         if self._announced > self._limit:
             raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, _larger_than(self._limit))
         if takes_file:

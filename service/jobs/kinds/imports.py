@@ -27,10 +27,13 @@ class ImportIn(Model):
         description="Path relative to the allowed folder; `.` is that folder itself.",
         examples=["stj"],
     )
+    uploaded: bool = Field(default=False, description="`folder` is the name of an uploaded one.")
 
 
-def allowed_root(settings: Settings) -> Path:
+def allowed_root(settings: Settings, *, uploaded: bool = False) -> Path:
     """The folder whose subfolders may be imported; ConflictError if the operator allowed none."""
+    if uploaded:
+        return settings.uploads_dir
     if settings.import_root is None:
         raise ConflictError(
             "no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first"
@@ -52,7 +55,8 @@ def allowed_folder(root: Path, folder: str) -> Path:
     # disk.
     if not path.is_relative_to(top) or not path.is_dir():
         raise InvalidInputError(
-            f"folder: there is no folder {folder!r} under the one that may be imported"
+            f"folder: there is no folder {folder!r} under the one that may be imported; an uploaded"
+            " one is deleted after its import, or after a day"
         )
     return path
 
@@ -62,7 +66,7 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
 
     Files that cannot be read, or that a link leads to outside of the allowed folder, are skipped.
     """
-    root = allowed_root(context.runtime.settings)
+    root = allowed_root(context.runtime.settings, uploaded=payload.uploaded)
     with confined_to(root):
         return _import(context, read_folder(allowed_folder(root, payload.folder), whole_field=True))
 
@@ -92,5 +96,5 @@ KIND = Kind(
     import_allowed,
     "Load a measurement folder into the store.",
     so_far=_until_then,
-    require=allowed_root,
+    require=lambda payload, settings: allowed_root(settings, uploaded=payload.uploaded),
 )

@@ -7,12 +7,14 @@ from typing import Annotated, Any, Literal
 from fastapi import (
     APIRouter,
     Depends,
+    File,
     Header,
     HTTPException,
     Path,
     Query,
     Request,
     Response,
+    UploadFile,
     status,
 )
 from pydantic import Field
@@ -24,11 +26,13 @@ from service.drawing.pictures import flux_picture
 from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
 from service.jobs.kinds.plans import MAX_TIMES, map_name
+from service.jobs.uploads import UploadedFolder, receive_upload
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.listing import Order, Period
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
     OPERATE,
     READ,
     IdentityDep,
@@ -37,6 +41,7 @@ from service.web.auth.dependencies import (
     PresentedDep,
     RuntimeDep,
     StoppingDep,
+    accept_archive,
     require_json,
 )
 from service.web.responses import formats
@@ -166,7 +171,7 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
         if kind.require is not None:
-            kind.require(runtime.settings)
+            kind.require(payload, runtime.settings)
         row = enqueue(runtime, kind, payload, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
         return job_out(row)
@@ -208,6 +213,24 @@ def list_jobs(
         )
     items = [job_summary(row) for row in rows]
     return page(items, limit)
+
+
+@router.post(
+    "/imports/uploads",
+    status_code=status.HTTP_201_CREATED,
+    responses=problems(413, 415, 429, 507),
+    dependencies=[OPERATE, Depends(accept_archive), COMPUTE_SLOT],
+)
+def post_import_upload(
+    file: Annotated[UploadFile, File(description="ZIP file of a measurement folder.")],
+    runtime: RuntimeDep,
+) -> UploadedFolder:
+    """Upload a measurement folder for an import.
+
+    `POST /v1/jobs/imports` imports it, with its `folder` and `uploaded`. It is deleted when its
+    import has ended, or after a day without one.
+    """
+    return receive_upload(runtime.settings, file.file, file.filename or "")
 
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])

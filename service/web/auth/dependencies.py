@@ -139,8 +139,17 @@ async def require_multipart(request: Request) -> None:
     """Refuse a body that is not a form with files."""
     if _content_type(request) != "multipart/form-data":
         raise UnsupportedContentError(
-            "Content-Type: send the image and its metadata as multipart/form-data"
+            "Content-Type: send the file and its fields as multipart/form-data"
         )
+
+
+async def accept_archive(_: Annotated[None, Depends(require_multipart)]) -> None:
+    """Accept a form with a ZIP file, which may be larger than a photograph."""
+
+
+def takes_archive(route: Any) -> bool:
+    """Whether a route accepts a form with a ZIP file."""
+    return accept_archive in dependencies_of(route)
 
 
 def takes_upload(route: Any) -> bool:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi import APIRouter, Depends, File, Form, Query, Request, Response, UploadFile
 from fastapi.responses import HTMLResponse
 from pydantic import model_validator
 
@@ -15,8 +15,16 @@ from service.jobs.kinds import calibrations, imports, predictions
 from service.jobs.kinds.calibrations import CalibrationIn
 from service.jobs.kinds.imports import ImportIn, allowed_folder, allowed_root
 from service.jobs.kinds.predictions import PredictionsIn
+from service.jobs.uploads import read_upload, receive_upload
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.auth.dependencies import OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    OPERATE,
+    READ,
+    IdentityDep,
+    RuntimeDep,
+    accept_archive,
+)
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False, prefix="/jobs")
@@ -27,12 +35,13 @@ _MOST_FOLDERS = 200
 class StartQuery(Model):
     """What the page computes costs of: one ``heliostat`` or all, a method, and a folder.
 
-    Predictions take photographs since ``since``.
+    Predictions take photographs since ``since``. The folder may be an ``uploaded`` one.
     """
 
     heliostat: Name | None = None
     method: Method = "refined"
     folder: Text | None = None
+    uploaded: bool = False
     since: Moment | None = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
@@ -66,9 +75,10 @@ def get_start_page(
 ) -> HTMLResponse:
     """Predictions, calibration, import and uploads, each with its expected cost."""
     settings = runtime.settings
-    folder = None
+    folder = upload = None
     if query.folder is not None:
-        folder = allowed_folder(allowed_root(settings), query.folder)
+        folder = allowed_folder(allowed_root(settings, uploaded=query.uploaded), query.folder)
+        upload = read_upload(folder) if query.uploaded else None
     with runtime.database.reading() as session:
         if query.heliostat is not None:
             store.get_heliostat(session, query.heliostat)
@@ -79,7 +89,9 @@ def get_start_page(
             prediction=prediction_cost(session, query.heliostat, query.method),
             calibration=calibration_cost(session, query.heliostat),
             importing=None if folder is None else import_cost(session, folder),
+            upload=upload,
             folders=_folders(settings.import_root),
+            limits=(settings.max_body_bytes_of_key, settings.max_unpacked_bytes),
         )
 
 
@@ -108,6 +120,15 @@ def post_calibrations_form(
 def post_imports_form(
     form: Annotated[ImportIn, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
-    """Enqueue the import of a folder, and go to the page of the job."""
-    allowed_folder(allowed_root(runtime.settings), form.folder)
-    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name).id}")
+    """Enqueue the import of a folder, and go to the page of the job. An upload has one job."""
+    root = allowed_root(runtime.settings, uploaded=form.uploaded)
+    folder = allowed_folder(root, form.folder)
+    key = folder.name if form.uploaded else None
+    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name, key).id}")
+
+
+@router.post("/imports/upload", dependencies=[OPERATE, Depends(accept_archive), COMPUTE_SLOT])
+def post_upload_form(file: Annotated[UploadFile, File()], runtime: RuntimeDep) -> Response:
+    """Unpack and check a ZIP file, and show what its import would cost."""
+    upload = receive_upload(runtime.settings, file.file, file.filename or "")
+    return go_to(f"/jobs/start?folder={upload.folder}&uploaded=true#imports")

@@ -323,9 +323,8 @@ def test_import_never_leaves_its_root(bare: TestClient, settings: Settings, fold
     (root / "link").symlink_to(settings.data_dir)
     job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": folder}))
     assert job["state"] == "failed"
-    assert (
-        job["reason"] == f"folder: there is no folder {folder!r} under the one that may be imported"
-    )
+    reason = f"folder: there is no folder {folder!r} under the one that may be imported; "
+    assert job["reason"].startswith(reason)
 
 
 def test_what_is_bad_in_an_imported_folder_costs_only_itself(
