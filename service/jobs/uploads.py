@@ -30,9 +30,9 @@ class UploadedFolder(BaseModel):
     """What an uploaded folder has."""
 
     folder: str = Field(description="Name: that of the ZIP file, and a random number.")
-    heliostats: int = Field(description="Number of heliostats.")
-    measurements: int = Field(description="Number of measurements, with an image or without.")
-    unreadable: int = Field(description="Number of entries that its import will skip.")
+    n_heliostats: int = Field(description="Number of heliostats.")
+    n_measurements: int = Field(description="Number of measurements, with an image or without.")
+    n_unreadable: int = Field(description="Number of entries that its import will skip.")
 
 
 def receive_upload(settings: Settings, file: IO[bytes], name: str) -> UploadedFolder:
@@ -68,7 +68,10 @@ def read_upload(path: Path) -> UploadedFolder:
     except InvalidInputError as error:
         raise InvalidInputError(str(error).replace(str(path), "file")) from None
     return UploadedFolder(
-        folder=path.name, heliostats=len(names), measurements=count, unreadable=len(folder.skipped)
+        folder=path.name,
+        n_heliostats=len(names),
+        n_measurements=count,
+        n_unreadable=len(folder.skipped),
     )
 
 

@@ -142,4 +142,4 @@ def test_unused_uploads_are_deleted(client: TestClient, settings: Settings, fold
     for job in jobs:
         client.post(f"/v1/jobs/{job}/cancel")
     assert _stored(settings) == []
-    assert _upload(client, zipped(folder), UPLOADS).json()["measurements"] == 1
+    assert _upload(client, zipped(folder), UPLOADS).json()["n_measurements"] == 1
