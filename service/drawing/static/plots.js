@@ -75,7 +75,9 @@
     if (!data.limit) return;
     const y = u.valToPos(data.limit.number, "y", true);
     drawLine(u, [left, y], [left + width, y], "--bad", [8, 4]);
-    write(u, data.limit.label, left + width - 4 * ratio, y - 5 * ratio, "right", "--bad");
+    // The label is on the side of the limit that the last values are not on.
+    const isBelow = u.data.slice(1).some((values) => values.at(-1) > data.limit.number);
+    write(u, data.limit.label, left + width - 4 * ratio, y + (isBelow ? 14 : -5) * ratio, "right", "--bad");
   };
 
   const drawDots = (u, data) => {
