@@ -123,9 +123,10 @@ _PATH = re.compile(r"(?<![\w/])(/(?:photographs|jobs)\b(?:[^\s,;()]*\w)?)")
 
 
 def _linked(text: str) -> Markup:
-    """Text with links instead of the paths of pages."""
+    """Text with links instead of the paths of pages, and with code for words in backticks."""
     parts = _PATH.split(text)
-    return Markup("").join(_link(part) if at % 2 else part for at, part in enumerate(parts))
+    linked = Markup("").join(_link(part) if at % 2 else part for at, part in enumerate(parts))
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(linked)))
 
 
 def _link(path: str) -> Markup:
