@@ -39,6 +39,13 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+SCROLLING = """() => [...document.querySelectorAll(".scroll")]
+    .filter((e) => e.getClientRects().length && e.scrollWidth > e.clientWidth)
+    .map((e) => `${e.querySelector("table").id} is ${e.scrollWidth - e.clientWidth} px too wide`)"""
+"""The visible tables that scroll sideways."""
+MENUS = """() => [...document.querySelectorAll("section.card")]
+    .filter((e) => e.querySelectorAll(".export").length > 1).map((e) => e.getAttribute("aria-labelledby"))"""
+"""The panels with several menus of exports."""
 DESK, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
 
 

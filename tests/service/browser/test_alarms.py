@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.service.browser.browsing import DESK, PHONE, expect, follow, violations
+from tests.service.browser.browsing import DESK, PHONE, SCROLLING, expect, follow, violations
 from tests.service.browser.test_shift import AXE, TOO_WIDE
 from tests.service.conftest import free_port, serving
 from tests.service.storm import CLOCK, UNDATED, make_storm, storm_app
@@ -80,6 +80,7 @@ def test_operator_reduces_a_storm_to_its_causes(
     # Later it is undone from the history.
     follow(page, "text=History >> nth=-1")
     expect(page.locator("#alarms tbody tr")).to_have_count(100)
+    assert page.evaluate(SCROLLING) == []
     check()
     for _ in range(2):
         follow(page, "#acknowledgements button >> nth=0")

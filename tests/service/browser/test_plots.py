@@ -10,7 +10,16 @@ import pytest
 
 from service.web.app import create_app
 from tests.service import real
-from tests.service.browser.browsing import DESK, PHONE, GatedOperations, Served, expect, violations
+from tests.service.browser.browsing import (
+    DESK,
+    MENUS,
+    PHONE,
+    SCROLLING,
+    GatedOperations,
+    Served,
+    expect,
+    violations,
+)
 from tests.service.conftest import free_port, serving
 
 MOVED = "BF17"
@@ -103,6 +112,19 @@ def test_exceeded_plan_says_so_in_words(page: Any):
     page.goto(plan_path(page))
     expect(page.locator("main")).to_contain_text("exceeds the limit of 0.500 kW/m² at 4 of 4 times")
     expect(page.locator("#series .beyond >> text=exceeds by")).to_have_count(4)
+
+
+def test_tables_of_a_calibrated_field_and_its_plan_fit_a_desk(page: Any):
+    for path in (
+        plan_path(page),
+        "/",
+        "/?metric=pointing_error_mrad&sort=misfit",
+        "/?sort=refused",
+    ):
+        page.goto(path)
+        expect(page.locator("main")).not_to_contain_text("being computed")
+        assert page.evaluate(SCROLLING) == [], path
+        assert page.evaluate(MENUS) == [], path
 
 
 def test_pointing_errors_over_years_have_their_limit(page: Any):

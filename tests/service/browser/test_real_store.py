@@ -12,7 +12,15 @@ import pytest
 
 from service.web.app import create_app
 from tests.service import real
-from tests.service.browser.browsing import GatedOperations, Served, expect, follow, violations
+from tests.service.browser.browsing import (
+    MENUS,
+    SCROLLING,
+    GatedOperations,
+    Served,
+    expect,
+    follow,
+    violations,
+)
 from tests.service.conftest import free_port, serving
 
 
@@ -60,14 +68,15 @@ PAGES = """() => [...document.querySelectorAll("a[href^='/']")].map((a) => a.get
     .filter((path) => !/^\\/(v1|docs)|[.]csv|report$|table=|figure=|format=/.test(path))"""
 
 
-def test_names_of_buttons_and_links_contain_what_is_written_on_them(page: Any):
-    """On a page of every kind that links lead to."""
+def test_names_contain_what_is_written_and_tables_fit_a_desk(page: Any):
+    """On a page of every kind that links lead to; a panel has one menu of exports."""
     waiting, seen, misnamed = ["/"], {"/"}, {}
     while waiting:
         path = waiting.pop(0)
         page.goto(path)
         found = page.evaluate(MISNAMED)
         found += violations(page, runOnly=["label-content-name-mismatch"])
+        found += page.evaluate(SCROLLING) + page.evaluate(MENUS)
         if found:
             misnamed[path] = found
         for link in page.evaluate(PAGES):

@@ -75,7 +75,7 @@ def test_active_surface_is_compared_with_the_version_before(pages: TestClient):
 def test_time_range_of_the_link_bounds_what_is_shown(pages: TestClient):
     def dots(path: str) -> int:
         charts = settled(pages, path).partition("Over time")[2]
-        return charts.partition("Deviation from the ideal")[0].count("<circle")
+        return charts.partition('id="timeline-2-caption"')[0].count("<circle")
 
     path = "/compare?heliostat=AA39&version=1&other_version=2"
     assert dots(path) == 6

@@ -80,12 +80,12 @@ def test_warnings_are_shown_with_reasons_and_time(client: TestClient):
         'heliotwin_heliostat_warned_since_seconds{acknowledged="no",heliostat="AA39"} 1.' in metrics
     )
     field, page = (
-        client.get("/", headers=HTML).text,
+        client.get("/?metric=sun_span_deg", headers=HTML).text,
         client.get("/heliostats/AA39", headers=HTML).text,
     )
     assert 'class="flagged"' in field
     assert "Span of suns [°]" in field
-    assert "Not acknowledged" in field
+    assert "1 warning, not acknowledged" in field
     for html_page in (field, page):
         assert "hotograph 2 is not explained: 31% of it is missed" in html_page
     assert "Acknowledge</button>" in page
