@@ -45,6 +45,7 @@ def test_photographs_are_accepted_excluded_skipped_and_undone(queue: TestClient)
     assert "1 of 3" in page.words
     assert "refused" in page.one("h2", id="verdict-title").words
     assert not page.all("button", data_key="a")
+    assert "open its page and correct the target" in page.words
     page = text_of(queue, page.one("a", data_key="s")["href"])
     assert "2 of 3" in page.words
     assert "forecasts it with an accuracy of" in page.words
@@ -59,6 +60,9 @@ def test_photographs_are_accepted_excluded_skipped_and_undone(queue: TestClient)
     assert not page.all("button", data_key="u")
     (item, *_) = queue.get("/v1/audit").json()["items"]
     assert (item["action"], item["subject"]) == ("measurement.reviewed", "heliostat AA39 2")
+    trail = text_of(queue, "/plant/audit")
+    assert trail.one(title="measurement.reviewed").words == "Measurement reviewed"
+    text_of(queue, trail.one("a", href="/heliostats/AA39/photographs/2")["href"])
     page = press(queue, page, "a")
     assert "The end of the queue of 3" in page.words
     (correction, undone) = queue.get("/v1/heliostats/AA39/measurements/2/corrections").json()[
