@@ -62,7 +62,7 @@ def test_photographs_are_accepted_excluded_skipped_and_undone(queue: TestClient)
     assert (item["action"], item["subject"]) == ("measurement.reviewed", "heliostat AA39 2")
     trail = text_of(queue, "/plant/audit")
     assert trail.one(title="measurement.reviewed").words == "Measurement reviewed"
-    text_of(queue, trail.one("a", href="/heliostats/AA39/photographs/2")["href"])
+    text_of(queue, trail.all("a", href="/heliostats/AA39/photographs/2")[0]["href"])
     page = press(queue, page, "a")
     assert "The end of the queue of 3" in page.words
     (correction, undone) = queue.get("/v1/heliostats/AA39/measurements/2/corrections").json()[

@@ -85,7 +85,7 @@ def test_warnings_are_shown_with_reasons_and_time(client: TestClient):
     )
     assert 'class="flagged"' in field
     assert "Span of suns [°]" in field
-    assert "1 warning, not acknowledged" in field
+    assert "warnings, not acknowledged" in field
     for html_page in (field, page):
         assert "hotograph 2 is not explained: 31% of it is missed" in html_page
     assert "Acknowledge</button>" in page
