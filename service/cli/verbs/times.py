@@ -28,8 +28,8 @@ def times(
     from service.base.settings import Settings
     from service.sources.files import require_regular
     from service.store.database import require_store
-    from service.twin.photographs.batches import correct_many
-    from service.twin.photographs.times import TIMES, read_times
+    from service.twin.photographs.batches import TIMES, correct_many
+    from service.twin.photographs.times import read_times
     from service.twin.runtime.runtime import Runtime
 
     with require_regular(file).open(encoding="utf-8-sig", newline="") as lines:

@@ -26,7 +26,10 @@ from service.twin.runtime.runtime import Runtime
 MOST_ENTRIES = 2000
 """Most corrections that are given at once."""
 
-_UNDONE = ".undone"
+TIMES, MOTORS = "times.corrected", "motors.corrected"
+"""Actions of the audit trail."""
+
+_UNDONE = {TIMES: "times.undone", MOTORS: "motors.undone"}
 _FIELDS = ("taken_at", "motor_position")
 
 
@@ -134,9 +137,9 @@ def list_batches(session: Session, limit: int) -> list[tuple[AuditRow, bool]]:
     """The newest entries that `undo_batch` accepts, and whether each is undone."""
     row = AuditRow
     query = select(row).order_by(row.id.desc())
-    corrected = row.action.in_(("times.corrected", "motors.corrected"))
-    rows = session.scalars(query.where(corrected).limit(limit)).all()
-    undone = session.scalars(query.where(row.action.endswith(_UNDONE)).limit(10 * limit))
+    rows = session.scalars(query.where(row.action.in_(_UNDONE)).limit(limit)).all()
+    first = min((one.id for one in rows), default=0)
+    undone = session.scalars(query.where(row.action.in_(_UNDONE.values()), row.id > first))
     numbers = {one.detail.get("undone") for one in undone}
     return [(one, one.id in numbers) for one in rows]
 
@@ -155,7 +158,7 @@ def undo_batch(runtime: Runtime, number: int, actor: str) -> int:
     """
     with runtime.database.reading() as session:
         entry = session.get(AuditRow, number)
-        if entry is None or not entry.action.endswith(".corrected") or "first" not in entry.detail:
+        if entry is None or entry.action not in _UNDONE:
             raise NotFoundError(f"there is no correction of many photographs {number}")
         reason = f"undone: {entry.detail['reason']}"[:200]
         done, measured = CorrectionRow, MeasurementRow
@@ -182,8 +185,9 @@ def undo_batch(runtime: Runtime, number: int, actor: str) -> int:
         }
     if not given:
         raise ConflictError(f"correction {number} is undone, or all was corrected again")
-    action = entry.action.replace(".corrected", _UNDONE)
-    return correct_many(runtime, list(given.values()), reason, actor, action, undone=number)
+    return correct_many(
+        runtime, list(given.values()), reason, actor, _UNDONE[entry.action], undone=number
+    )
 
 
 def _restoring(correction: CorrectionRow, reason: str) -> PhotographChanges:

@@ -16,9 +16,6 @@ from service.store.photographs.groups import PhotographFilter, list_groups
 from service.twin.photographs.batches import MOST_ENTRIES, GivenCorrection
 from service.twin.photographs.corrections import PhotographChanges
 
-TIMES, MOTORS = "times.corrected", "motors.corrected"
-"""Actions of the audit trail."""
-
 _MOMENT = TypeAdapter(Moment)
 
 

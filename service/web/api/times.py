@@ -4,8 +4,8 @@ from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
 from service.base.fields import MeasurementName, Model, Moment, Name, Reason
-from service.twin.photographs.batches import MOST_ENTRIES, correct_many
-from service.twin.photographs.times import TIMES, given_time
+from service.twin.photographs.batches import MOST_ENTRIES, TIMES, correct_many
+from service.twin.photographs.times import given_time
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

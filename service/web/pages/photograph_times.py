@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, File, Form, Path, Query, Request, Respon
 from fastapi.responses import HTMLResponse
 from pydantic import Field
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from model.times import format_time
@@ -16,13 +17,15 @@ from service.store.tables import HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.batches import (
     MOST_ENTRIES,
+    MOTORS,
+    TIMES,
     GivenCorrection,
     correct_many,
     list_batches,
     preview_many,
     undo_batch,
 )
-from service.twin.photographs.times import MOTORS, TIMES, read_motors, read_times, shifted_times
+from service.twin.photographs.times import read_motors, read_times, shifted_times
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -59,18 +62,13 @@ class TimesForm(Model):
     what: What = "times"
 
 
-def _counts(runtime: Runtime) -> list[tuple[str, int]]:
+def _counts(session: Session) -> list[tuple[str, int]]:
     """Heliostats with photographs of unknown time, the most first."""
-    row, n = (
-        MeasurementRow,
-        func.count(
-            func.distinct(func.coalesce(MeasurementRow.external_id, MeasurementRow.identifier))
-        ),
-    )
+    row = MeasurementRow
+    n = func.count(func.distinct(func.coalesce(row.external_id, row.identifier)))
     query = select(HeliostatRow.name, n).join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
     query = query.where(row.taken_at.is_(None)).group_by(HeliostatRow.name)
-    with runtime.database.reading() as session:
-        found = session.execute(query.order_by(n.desc(), HeliostatRow.name)).all()
+    found = session.execute(query.order_by(n.desc(), HeliostatRow.name)).all()
     return [(name, count) for name, count in found]
 
 
@@ -84,9 +82,10 @@ def get_times_page(
             request,
             "photograph_times.html",
             query=query,
-            counts=_counts(runtime),
+            counts=_counts(session),
             targets=target_names(session),
             zone=plant_time_zone(session, runtime.settings.time_zone),
+            most=MOST_ENTRIES,
             recent=list_batches(session, _LISTED),
         )
 

@@ -59,6 +59,21 @@ def test_times_are_previewed_stored_and_undone(client: TestClient, taken: list[d
     assert history[-1]["after"] == {"taken_at": None}
 
 
+def test_an_undone_change_stays_so_while_alarms_are_undone(
+    client: TestClient, taken: list[dict[str, Any]]
+):
+    lines = "\n".join(f"AA39,{one['id']},{one['taken_at']}" for one in taken)
+    client.post(PATH, data={"lines": lines, "reason": REASON}, headers=HTML)
+    number = client.get("/v1/audit").json()["items"][0]["id"]
+    client.post(f"{PATH}/{number}/undo", headers=HTML)
+    for _ in range(51):
+        ids = [item["id"] for item in client.get("/v1/attention").json()["items"][:1]]
+        body = {"ids": ids, "reason": "known"}
+        done = client.post("/v1/attention/acknowledgements", json=body).json()["items"][0]
+        client.post(f"/v1/attention/acknowledgements/{done['acknowledgement']}/undo")
+    assert f"{PATH}/{number}/undo" not in client.get(PATH, headers=HTML).text
+
+
 def test_an_undo_keeps_what_was_corrected_since(client: TestClient, taken: list[dict[str, Any]]):
     lines = "\n".join(f"AA39,{one['id']},{one['taken_at']}" for one in taken)
     client.post(PATH, data={"lines": lines, "reason": REASON}, headers=HTML)
