@@ -23,7 +23,7 @@ from model.aiming.plan import AimPlan, plan_aims
 from model.ephemeris import sun_positions
 from model.frames import sun_direction
 from model.plant import Receiver, square_pixels
-from model.times import format_time
+from model.times import format_minute, format_time
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
@@ -397,7 +397,7 @@ class _Planner:
 
     def _report(self, index: int, share: float, message: str) -> None:
         total, (at, _) = len(self.suns.steps), self.suns.steps[index]
-        when = "" if at is None else f"{at.astimezone(ZoneInfo(self.suns.zone)):%H:%M}, "
+        when = "" if at is None else f"{format_minute(at)}, "
         self.context.report(
             (index + share) / total,
             f"{when}{message}",

@@ -13,7 +13,7 @@ from model.ephemeris import sun_positions
 from model.fleet import FleetFlux
 from model.plant import Cylinder, Receiver
 from model.receivers import Cavity, Panels
-from model.times import format_time
+from model.times import format_minute, format_time
 from service import store
 from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text, VersionIn
 from service.jobs.common import require_some
@@ -234,7 +234,7 @@ class _Time:
 
         def report(share: float, message: str, **_counts: Any) -> None:
             whole = (self.index + begun + share / 2) / self.total
-            what = f"{self.at:%H:%M} UTC, {message}"
+            what = f"{format_minute(self.at)}, {message}"
             self.context.report(
                 whole, what, phase="times of the plan", n_done=self.index, n_total=self.total
             )

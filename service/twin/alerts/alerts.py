@@ -14,12 +14,14 @@ from datetime import UTC, datetime, timedelta
 from datetime import time as clock
 from itertools import pairwise
 from typing import NamedTuple
+from zoneinfo import ZoneInfo
 
 from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
+from model.times import format_minute
 from service.base.settings import Settings
 from service.store import acknowledgements
 from service.store.columns import now
@@ -45,7 +47,7 @@ from service.twin.alerts.field_overview import (
 )
 from service.twin.alerts.light import LostLight, find_lost_light
 from service.twin.alerts.reasons import REASONS, Reason, Severity
-from service.twin.forecasts.aim_sources import outdated_plans
+from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.studies.camera_watch import FIGURES, CameraChange
@@ -133,7 +135,7 @@ def alerts_of_heliostats(
         *_queue(session, settings),
         *_outdated_aims(session, settings),
         *_camera(session),
-        *_watch_cameras(session, cameras),
+        *_watch_cameras(session, cameras, plant_time_zone(session, settings.time_zone)),
         *_clock(session),
     ]
     found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
@@ -209,7 +211,8 @@ def _pointing(
             "drift",
             line.name,
             drifted.since,
-            f"its drives went {drifted.size_mrad:.1f} mrad slowly until {drifted.until:%Y-%m-%d}",
+            f"its drives went {drifted.size_mrad:.1f} mrad slowly until"
+            f" {format_minute(drifted.until)}",
             "look at its foundation and drives, and calibrate its mount often",
             _fingerprint(drifted.since, drifted.size_mrad),
         )
@@ -248,7 +251,7 @@ def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> I
         message = (
             "none was ever accepted"
             if last is None
-            else f"the last accepted one is of {last:%Y-%m-%d}"
+            else f"the last accepted one is of {format_minute(last)}"
         )
         action = "photograph it where the calibration plan says"
         if count:
@@ -458,11 +461,11 @@ def _camera(session: Session) -> Iterator[Alert]:
         )
 
 
-def _watch_cameras(session: Session, cameras: Sequence[CameraChange]) -> Iterator[Alert]:
+def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alert]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
     for change in cameras:
-        since = datetime.combine(change.day, clock(), UTC)
+        since = datetime.combine(change.day, clock(), ZoneInfo(zone)).astimezone(UTC)
         if declared is None or since > declared.adopted_at:
             way = "up" if change.ratio > 1 else "down"
             times = f"{change.ratio:.2f} times what it was"

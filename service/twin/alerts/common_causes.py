@@ -15,6 +15,7 @@ from statistics import median
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from model.times import format_minute
 from service.base.settings import Settings
 from service.store.job_tables import JobRow
 from service.store.tables import (
@@ -24,7 +25,7 @@ from service.store.tables import (
     ModelRow,
     TargetRow,
 )
-from service.twin.alerts.acknowledging import group_token
+from service.twin.alerts.acknowledging import AlertsTogether
 from service.twin.alerts.alerts import Alert
 from service.twin.alerts.reasons import REASONS, Reason
 
@@ -58,21 +59,10 @@ _WHEN_TAKEN: tuple[Reason, ...] = ("accuracy", "fell", "moved", "pointing")
 
 
 @dataclass(frozen=True)
-class CommonCause:
+class CommonCause(AlertsTogether):
     """Alerts that probably have one cause. ``evidence`` is empty if the store has none."""
 
-    alerts: tuple[Alert, ...]
     evidence: tuple[str, ...]
-
-    @property
-    def first_at(self) -> datetime:
-        """Since when the oldest alert lasts."""
-        return min(alert.since for alert in self.alerts)
-
-    @property
-    def last_at(self) -> datetime:
-        """Since when the newest alert lasts."""
-        return max(alert.since for alert in self.alerts)
 
     @property
     def heliostats(self) -> list[str]:
@@ -87,7 +77,7 @@ class CommonCause:
     @property
     def token(self) -> str:
         """Identifier of the cause with exactly these alerts."""
-        return group_token("cause", self.alerts)
+        return self.token_for("cause")
 
 
 def find_common_causes(
@@ -160,7 +150,7 @@ def _models(session: Session, first: datetime, last: datetime) -> Iterator[str]:
     for row in session.scalars(select(ModelRow).order_by(ModelRow.number)):
         for at, verb in ((row.adopted_at, "became active"), (row.withdrawn_at, "was withdrawn")):
             if at is not None and first <= at <= last:
-                yield f"version {row.number} of the model {verb} on {at:%Y-%m-%d %H:%M} UTC"
+                yield f"version {row.number} of the model {verb} on {format_minute(at)}"
 
 
 def _jobs(session: Session, kind: str, cause: CommonCause) -> Iterator[str]:
@@ -229,8 +219,9 @@ def _unphotographed(session: Session, cause: CommonCause, settings: Settings) ->
     names = HeliostatRow.name.in_(cause.heliostats[:_MOST_NAMES])
     newest_added = session.scalar(select(func.max(HeliostatRow.created_at)).where(names))
     if newest is not None and newest <= last + _WINDOW / 24:
-        yield f"no heliostat was photographed after {newest:%Y-%m-%d %H:%M} UTC"
+        yield f"no heliostat was photographed after {format_minute(newest)}"
     elif newest is None:
         yield "no photograph with a known time was ever accepted"
     if newest_added is not None and abs(newest_added - last) < _WINDOW:
-        yield f"the heliostats were added on {newest_added:%Y-%m-%d}, and not photographed since"
+        added = format_minute(newest_added)
+        yield f"the heliostats were added at {added}, and not photographed since"

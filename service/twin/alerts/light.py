@@ -74,7 +74,7 @@ def _without_days(readings: list[LightReading]) -> Array:
     day_part = np.zeros_like(light)
     for _ in range(_ROUNDS):
         left -= _medians(readings, left, lambda one: one.heliostat)
-        part = _medians(readings, left, lambda one: one.taken_at.date())
+        part = _medians(readings, left, lambda one: one.day)
         left -= part
         day_part += part
     return np.asarray(light - day_part)

@@ -17,6 +17,7 @@ from model.images import FLUX_SUM
 from model.plant import Receiver, TargetPlane
 from model.setup import Setup
 from model.surface import DEGREE, control_points
+from model.times import format_minute
 from model.tracing import Window
 from service import store
 from service.base.arrays import pack, to_json_value, unpack
@@ -80,7 +81,7 @@ def position_of(session: Session, sun: Sun | SunAt) -> Sun:
     azimuth, elevation = sun_angles_at(sun.at, store.get_plant(session).origin)
     if elevation <= 0:
         raise InvalidInputError(
-            f"at: the sun is {-elevation:.1f}° below the horizon at {sun.at:%Y-%m-%d %H:%M} UTC;"
+            f"at: the sun is {-elevation:.1f}° below the horizon at {format_minute(sun.at)};"
             " choose a time of the day"
         )
     return Sun(azimuth_deg=azimuth, elevation_deg=elevation)

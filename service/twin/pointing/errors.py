@@ -18,6 +18,7 @@ from model.errors import ModelError
 from model.pointing import Reading, pointing_error
 from model.pointing.report import moment_of
 from model.pointing.spots import spot_covariance
+from model.times import format_minute
 from service import store
 from service.base.errors import ServiceError
 from service.store.pointing import mounts
@@ -64,13 +65,8 @@ class DriveStep:
 
     @property
     def when(self) -> str:
-        """The days between which it moved, in words, or the times of one day."""
-        first, last = (f"{moment.day} {moment:%B %Y}" for moment in (self.since, self.until))
-        if first == last:
-            return f"between {self.since:%Y-%m-%d %H:%M} UTC and {self.until:%Y-%m-%d %H:%M} UTC"
-        for same in (f" {self.until:%B %Y}", f" {self.until:%Y}"):
-            first = first.removesuffix(same)
-        return f"between {first} and {last}"
+        """The times between which it moved, in words."""
+        return f"between {format_minute(self.since)} and {format_minute(self.until)}"
 
 
 @dataclass(frozen=True)

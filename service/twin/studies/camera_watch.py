@@ -10,9 +10,10 @@ import threading
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, datetime, timedelta
 from datetime import time as clock
 from typing import NamedTuple
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from cachetools import TTLCache
@@ -23,6 +24,7 @@ from sqlalchemy.orm import Session
 from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import MeasurementRow, TargetRow
+from service.twin.forecasts.aim_sources import plant_time_zone
 
 FIGURES = {
     "signal_to_background": "the spot over the sheet",
@@ -42,11 +44,12 @@ _OF_DEVIATION, _OF_MEDIAN = 1.4826, 1.2533
 
 
 class LightReading(NamedTuple):
-    """Light of a photograph: the logarithm of the spot over the sheet."""
+    """Light of a photograph: the logarithm of the spot over the sheet. ``day`` is the plant's."""
 
     heliostat: int
     target: str
     taken_at: datetime
+    day: date
     light: float
 
 
@@ -101,9 +104,9 @@ def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraC
     return max(found, key=lambda change: change.certainty, default=None)
 
 
-def _of_day(session: Session, day: date) -> _DayFigures:
-    """Figures of a day, over its last accepted photographs."""
-    begin = datetime.combine(day, clock(), UTC)
+def _of_day(session: Session, day: date, zone: str) -> _DayFigures:
+    """Figures of a day in a time ``zone``, over its last accepted photographs."""
+    begin = datetime.combine(day, clock(), ZoneInfo(zone))
     row = MeasurementRow
     query = select(row.heliostat_id, TargetRow.name, row.taken_at, row.kind, row.quality)
     query = query.join(TargetRow, TargetRow.id == row.target_id).where(
@@ -118,7 +121,7 @@ def _of_day(session: Session, day: date) -> _DayFigures:
         if min(figures) > 0:
             found[name].append(figures)
             if kind in _WITH_SHEET:
-                light.append(LightReading(heliostat, name, taken_at, math.log(figures[0])))
+                light.append(LightReading(heliostat, name, taken_at, day, math.log(figures[0])))
     medians = {name: np.median(np.log(figures), axis=0) for name, figures in found.items()}
     return _DayFigures(medians, light)
 
@@ -135,11 +138,12 @@ class CameraWatch:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._days: TTLCache[date, _DayFigures] = TTLCache(2 * _WINDOW_DAYS, _HOLDS_S)
+        self._days: TTLCache[tuple[date, str], _DayFigures] = TTLCache(2 * _WINDOW_DAYS, _HOLDS_S)
 
     def read(self, session: Session, settings: Settings) -> CameraReadings:
         """Camera changes in the order of target names, and the light of all days, newest first."""
-        days = self._read(session, now().date())
+        zone = plant_time_zone(session, settings.time_zone)
+        days = self._read(session, now().astimezone(ZoneInfo(zone)).date(), zone)
         daily: dict[str, dict[date, NDArray[np.float64]]] = defaultdict(dict)
         for day, of in days.items():
             for name, medians in of.medians.items():
@@ -150,10 +154,11 @@ class CameraWatch:
             [one for day in days.values() for one in day.light],
         )
 
-    def _read(self, session: Session, today: date) -> dict[date, _DayFigures]:
+    def _read(self, session: Session, today: date, zone: str) -> dict[date, _DayFigures]:
         days = {}
         with self._lock:
             for day in (today - timedelta(days=ago) for ago in range(_WINDOW_DAYS)):
-                known = self._days.get(day) if day < today else None
-                days[day] = self._days[day] = _of_day(session, day) if known is None else known
+                key = (day, zone)
+                known = self._days.get(key) if day < today else None
+                days[day] = self._days[key] = known or _of_day(session, day, zone)
         return days

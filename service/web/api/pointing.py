@@ -30,7 +30,7 @@ class MovedOut(BaseModel):
             "The same in words. If the photographs have no times, it names them, and `since` and"
             " `until` are when they arrived."
         ),
-        examples=["between 12 and 14 August 2024"],
+        examples=["between 2024-08-12 09:10 UTC and 2024-08-14 10:05 UTC"],
     )
     size_mrad: float = Field(
         description=("Step of its drives; if not calibrated, the pointing error [mrad].")

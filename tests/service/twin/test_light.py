@@ -27,6 +27,7 @@ def readings(
             number,
             "lower",
             FIRST + timedelta(days=day, minutes=number),
+            (FIRST + timedelta(days=day)).date(),
             float(light + haze[day] + rng.normal(0, SPREAD) + (lost[day] if number == 0 else 0.0)),
         )
         for number, light in enumerate(usual)

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from model.ephemeris import sun_angles_at
 from model.frames import sun_direction
+from model.times import format_minute
 from service.base.settings import Settings
 from service.cli.main import app as cli
 from service.sources.folder import read_folder
@@ -118,7 +119,7 @@ def test_attention_asks_for_times_and_goes_by_those_that_are_known(
     (item,) = attention(client, "no_photograph")  # that some came today says nothing
     assert (
         item["message"]
-        == f"the last accepted one is of {last:%Y-%m-%d}; the time of 2 more is unknown"
+        == f"the last accepted one is of {format_minute(last)}; the time of 2 more is unknown"
     )
     assert attention(client, "times_unknown") == []
     assert "Times unknown:" not in client.get("/attention", headers=HTML).text
