@@ -237,7 +237,12 @@ def predict(record: Recorder, root: Path) -> None:
     post_photograph(record, "AB12", file, about, 201)
     wrong = record.call("post_surface", f"POST {path}", 201, json={"measurements": ["199"]})
     assert wrong["trusted"] is False, wrong["warnings"]
-    record.call("acknowledge_surface", f"POST {path}/{wrong['version']}/acknowledge")
+    choice = {"version": wrong["version"], "reason": "to acknowledge its warnings"}
+    record.client.put(f"{path}/current", json=choice).raise_for_status()
+    record.call("list_causes", "GET /v1/heliostats/AB12/causes")
+    seen = {"reason": "photograph 199 is excluded"}
+    record.call("acknowledge_surface", f"POST {path}/{wrong['version']}/acknowledge", json=seen)
+    record.client.post(f"{path}/undo").raise_for_status()
     path = f"/v1/heliostats/AB12/measurements/{wrong['measurements'][0]}"
     record.call("delete_measurement", f"DELETE {path}", params={"reason": about["reason"]})
     path = "/v1/heliostats/AB12/surfaces"

@@ -8,7 +8,7 @@ from datetime import datetime
 from sqlalchemy.orm import Session
 
 from service import store
-from service.base.errors import NotFoundError
+from service.base.errors import ConflictError, NotFoundError
 from service.store import acknowledgements
 from service.store.acknowledgements import AlarmHistory
 from service.store.surfaces import decisions
@@ -41,16 +41,10 @@ class AlertFilter:
 
 
 @dataclass(frozen=True)
-class AlertGroup:
-    """Alerts of one reason."""
+class AlertsTogether:
+    """Alerts that are acknowledged together."""
 
-    reason: Reason
     alerts: tuple[Alert, ...]
-
-    @property
-    def severity(self) -> Severity:
-        """Severity of the reason."""
-        return REASONS[self.reason].severity
 
     @property
     def count(self) -> int:
@@ -58,48 +52,57 @@ class AlertGroup:
         return len(self.alerts)
 
     @property
-    def first(self) -> datetime:
+    def first_at(self) -> datetime:
         """Since when the oldest alert lasts."""
         return min(alert.since for alert in self.alerts)
 
     @property
-    def last(self) -> datetime:
+    def last_at(self) -> datetime:
         """Since when the newest alert lasts."""
         return max(alert.since for alert in self.alerts)
+
+    def token_for(self, name: str) -> str:
+        """Identifier of exactly these alerts, which changes if one comes, goes or changes."""
+        ids = "\n".join(sorted(alert.id for alert in self.alerts))
+        return f"{name}:{hashlib.sha256(ids.encode()).hexdigest()[:12]}"
+
+
+@dataclass(frozen=True)
+class AlertGroup(AlertsTogether):
+    """Alerts of one reason."""
+
+    reason: Reason
+
+    @property
+    def severity(self) -> Severity:
+        """Severity of the reason."""
+        return REASONS[self.reason].severity
 
     @property
     def token(self) -> str:
         """Identifier of the group with exactly these alerts."""
-        return group_token(self.reason, self.alerts)
-
-
-def group_token(name: str, alerts: Iterable[Alert]) -> str:
-    """Identifier of ``alerts``, which changes if one comes, goes or changes."""
-    ids = "\n".join(sorted(alert.id for alert in alerts))
-    return f"{name}:{hashlib.sha256(ids.encode()).hexdigest()[:12]}"
+        return self.token_for(self.reason)
 
 
 def group_alerts(alerts: Sequence[Alert]) -> list[AlertGroup]:
     """Group alerts by reason, the most urgent reason first."""
     groups = [
-        AlertGroup(reason, tuple(alert for alert in alerts if alert.reason == reason))
+        AlertGroup(tuple(alert for alert in alerts if alert.reason == reason), reason)
         for reason in REASONS
     ]
     return [group for group in groups if group.alerts]
 
 
 def acknowledge(
-    runtime: Runtime, cache: FieldOverviewCache, ids: Sequence[str], actor: str, comment: str
+    runtime: Runtime, found: AlertList, ids: Sequence[str], actor: str, comment: str
 ) -> list[Alert]:
-    """Acknowledge alerts for ``actor`` as one batch; return them in the order of their ids.
+    """Acknowledge some of the alerts ``found`` as one batch; return them in the order of ``ids``.
 
     Raises
     ------
     NotFoundError
         If an id is not a current alert. Then none is acknowledged.
     """
-    with runtime.database.reading() as session:
-        found = list_alerts(session, cache, runtime.settings)
     items = {item.id: item for item in found.alerts}
     missing = [number for number in ids if number not in items]
     if missing:
@@ -116,6 +119,30 @@ def acknowledge(
                 surface = _flagged_surface(session, heliostat)
                 decisions.acknowledge_warnings(session, heliostat, surface, actor)
     return [item.with_acknowledgement(row) for item, row in zip(chosen, rows, strict=True)]
+
+
+def acknowledge_surface(
+    runtime: Runtime, cache: FieldOverviewCache, name: str, version: int, actor: str, comment: str
+) -> None:
+    """Acknowledge the alert that a heliostat's surface is not trusted.
+
+    Raises
+    ------
+    ConflictError
+        If there is no such alert, or it is about another version.
+    """
+    with runtime.database.reading() as session:
+        heliostat = store.get_heliostat(session, name)
+        surface = store.get_surface(session, heliostat, version)
+        found = list_alerts(session, cache, runtime.settings)
+        is_shown = _flagged_surface(session, heliostat).id == surface.id
+    alerts = AlertFilter("untrusted", heliostat=name).choose(found.alerts)
+    if not (alerts and is_shown):
+        raise ConflictError(
+            f"heliostat {name}: surface {version} has no warnings to acknowledge; only those of"
+            " the active surface can be acknowledged"
+        )
+    acknowledge(runtime, found, [alert.id for alert in alerts], actor, comment)
 
 
 def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:

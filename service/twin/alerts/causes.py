@@ -13,6 +13,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.frames import sun_direction
+from model.times import format_minute
 from service import store
 from service.base.settings import Settings
 from service.store.tables import (
@@ -257,7 +258,7 @@ def _mirror(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]
         else "no photographs of others then to compare"
     )
     said = (
-        f"its forecasts are surely worse since {facts.fall.since:%Y-%m-%d}:"
+        f"its forecasts are surely worse since {format_minute(facts.fall.since)}:"
         f" {percent(facts.fall.earlier)} before, {percent(facts.fall.recent)} in the median; {kept}"
     )
     names = tuple(one.identifier for one in since)
@@ -353,7 +354,7 @@ def _moved(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
     if pointing.beyond_since is not None and pointing.error_mrad is not None:
         said = (
             f"its spot is {pointing.error_mrad:.1f} mrad off{metres}, beyond the limit since"
-            f" {pointing.beyond_since:%Y-%m-%d}"
+            f" {format_minute(pointing.beyond_since)}"
         )
         return [LikelyCause("moved", 0.5, said)]
     return []
@@ -410,8 +411,11 @@ def read_facts(
     surface: SurfaceRow | None,
     comparisons: Sequence[Comparison],
     settings: Settings,
-) -> HeliostatFacts:
-    """Read what `rank_causes` needs of a heliostat and of the surface that forecasts it."""
+) -> HeliostatFacts | None:
+    """Read what `rank_causes` needs of a heliostat and of the surface that forecasts it.
+
+    None if it is good: not below the accuracy limit, and none of its alarms is open.
+    """
     compared = {one.measurement.id: one.accuracy for one in comparisons}
     used = photographs_of_surface(surface)
     recent = store.recent_measurements(session, row, _NEWEST)
@@ -427,8 +431,14 @@ def read_facts(
         )
         for one in recent
     ]
+    drift = session.get(DriftRow, row.id)
+    fall = _fall(drift, settings)
+    accuracies = [rank_of(comparisons).accuracy, None if drift is None else drift.accuracy]
+    is_below = any(one is not None and one < settings.attention_accuracy for one in accuracies)
+    has_warnings = any(one.warnings for one in photographs)
+    if not (is_below or fall or has_warnings or _has_alarm(line)):
+        return None
     days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
-    drift, allowed = session.get(DriftRow, row.id), settings.attention_accuracy_drop
     return HeliostatFacts(
         settings.attention_accuracy,
         photographs,
@@ -443,9 +453,23 @@ def read_facts(
         None if surface is None else surface.misfit,
         _usual_misfit(session),
         _study(session, row.name),
-        Fall(drift.fell_since or drift.taken_at, drift.recent or 0.0, drift.earlier or 0.0)
-        if drift is not None and (drift.min_drop or 0) > allowed
-        else None,
+        fall,
+    )
+
+
+def _fall(drift: DriftRow | None, settings: Settings) -> Fall | None:
+    if drift is None or (drift.min_drop or 0.0) <= settings.attention_accuracy_drop:
+        return None
+    return Fall(drift.fell_since or drift.taken_at, drift.recent or 0.0, drift.earlier or 0.0)
+
+
+def _has_alarm(line: HeliostatOverview) -> bool:
+    """Whether its surface has warnings that nobody acknowledged, or its pointing is off."""
+    surface, pointing = line.surface or line.candidate, line.pointing
+    return bool(
+        (surface is not None and surface.warnings and surface.acknowledged_by is None)
+        or (pointing is not None and pointing.beyond_since is not None)
+        or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)
     )
 
 
@@ -488,27 +512,4 @@ def _study(session: Session, heliostat: str) -> StudyFinding | None:
         return None
     return StudyFinding(
         study.id, f"study {study.id} of its photographs: {study.conclusion.rstrip('.')}"
-    )
-
-
-def is_poor(
-    session: Session,
-    facts: HeliostatFacts,
-    row: HeliostatRow,
-    comparisons: Sequence[Comparison],
-    settings: Settings,
-) -> bool:
-    """Whether a heliostat is below the accuracy limit, or one of its alarms is open."""
-    drift = session.get(DriftRow, row.id)
-    accuracy = rank_of(comparisons).accuracy
-    shown = facts.line.surface or facts.line.candidate
-    pointing = facts.line.pointing
-    return bool(
-        (accuracy is not None and accuracy < settings.attention_accuracy)
-        or (drift is not None and drift.accuracy < settings.attention_accuracy)
-        or facts.fall is not None
-        or (shown is not None and shown.warnings and shown.acknowledged_by is None)
-        or (pointing is not None and pointing.beyond_since is not None)
-        or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)
-        or any(one.warnings for one in facts.photographs)
     )

@@ -191,7 +191,9 @@ def post_acknowledgements(
     An acknowledgement lasts until the reason of the alert changes or returns, or until it is
     undone. The first one is kept.
     """
-    items = acknowledge(runtime, cache, seen.ids, identity.name, seen.reason)
+    with runtime.database.reading() as session:
+        found = list_alerts(session, cache, runtime.settings)
+    items = acknowledge(runtime, found, seen.ids, identity.name, seen.reason)
     count.forget()
     return Page(items=[attention_out(item) for item in items], next=None)
 

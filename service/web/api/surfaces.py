@@ -36,13 +36,17 @@ from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
+from service.twin.alerts import acknowledging
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
+from service.web.api.attention import AttentionCountDep
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
+    OVERVIEW_SLOT,
     READ,
+    FieldCacheDep,
     IdentityDep,
     Limit,
     NamePath,
@@ -145,6 +149,12 @@ class ChoiceIn(Model):
 
     version: VersionIn = Field(description="Version of the surface.")
     reason: Reason = Field(description="Why; kept with the decision.")
+
+
+class SurfaceAcknowledgementIn(Model):
+    """Why the warnings of a surface are acknowledged."""
+
+    reason: Annotated[Reason, Field(description="Why they are acknowledged.")]
 
 
 class DecisionOut(BaseModel):
@@ -409,16 +419,27 @@ def get_surface(
     return surface_answer(runtime, heliostat, row, media_type)
 
 
-@router.post("/{version}/acknowledge", responses=problems(404, 409), dependencies=[OPERATE])
+@router.post(
+    "/{version}/acknowledge",
+    responses=problems(404, 409, 413, 415),
+    dependencies=[OPERATE, OVERVIEW_SLOT, Depends(require_json)],
+)
 def acknowledge_surface(
     name: NamePath,
     version: Annotated[Version, Path(description="Number of the version, from 1.")],
     runtime: RuntimeDep,
+    cache: FieldCacheDep,
+    count: AttentionCountDep,
     identity: IdentityDep,
+    body: Annotated[SurfaceAcknowledgementIn, Body()],
 ) -> SurfaceSummary:
-    """Acknowledge that a surface is not trusted. The answer is 409 if it is trusted."""
-    with runtime.database.writing() as session:
-        heliostat = store.get_heliostat(session, name)
-        row = store.get_surface(session, heliostat, version)
-        decisions.acknowledge_warnings(session, heliostat, row, identity.name)
+    """Acknowledge that the active surface is not trusted, as its alert.
+
+    The answer is 409 if it is trusted. `POST /v1/attention/acknowledgements/{number}/undo` undoes
+    it.
+    """
+    acknowledging.acknowledge_surface(runtime, cache, name, version, identity.name, body.reason)
+    count.forget()
+    with runtime.database.reading() as session:
+        row = store.get_surface(session, store.get_heliostat(session, name), version)
         return surface_summary(name, row)

@@ -17,6 +17,7 @@ from service.base.fields import MeasurementName, Name
 from service.jobs.kind import Kinds
 from service.twin.alerts.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.auth.fair_limiter import FairLimiter
 from service.web.auth.security import Identity, Requires, Role, dependencies_of, presented_key
 
@@ -36,6 +37,14 @@ async def _field(request: Request) -> FieldOverviewCache:
 
 
 FieldCacheDep = Annotated[FieldOverviewCache, Depends(_field)]
+
+
+async def _comparisons(request: Request) -> ComparisonCache:
+    cache: ComparisonCache = request.app.state.comparisons
+    return cache
+
+
+ComparisonCacheDep = Annotated[ComparisonCache, Depends(_comparisons)]
 """The cache of what is computed once for each heliostat of the field."""
 
 # For the ``dependencies`` of a route: each requires at least this role.

@@ -187,7 +187,8 @@ def post_acknowledgement_form(
     """Acknowledge the ticked alerts and groups with one reason, and return to the list."""
     ids = dict.fromkeys(form.ids)
     with runtime.database.reading() as session:
-        chosen = query.choose(list_alerts(session, cache, runtime.settings).alerts)
+        found = list_alerts(session, cache, runtime.settings)
+        chosen = query.choose(found.alerts)
         causes = find_common_causes(session, chosen, runtime.settings)
     groups = {group.token: group.alerts for group in group_alerts(chosen)}
     groups |= {cause.token: cause.alerts for cause in causes}
@@ -199,7 +200,7 @@ def post_acknowledgement_form(
                 " them again"
             )
         ids |= dict.fromkeys(alert.id for alert in groups[token])
-    done = acknowledge(runtime, cache, list(ids), identity.name, form.comment)
+    done = acknowledge(runtime, found, list(ids), identity.name, form.comment)
     count.forget()
     count.read()
     return go_to(query.link(done=done[0].acknowledgement))

@@ -48,9 +48,15 @@ from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import RECENT, ComparisonResult
-from service.web.auth.dependencies import COMPUTE_SLOT, READ, RENDER_SLOT, RuntimeDep
+from service.web.auth.dependencies import (
+    COMPUTE_SLOT,
+    READ,
+    RENDER_SLOT,
+    ComparisonCacheDep,
+    RuntimeDep,
+)
 from service.web.pages.forecast import sun_now
-from service.web.pages.heliostat import ComparisonCacheDep, newest_surfaces
+from service.web.pages.heliostat import newest_surfaces
 from service.web.pages.heliostat_charts import (
     OverTime,
     accuracy_over_time,

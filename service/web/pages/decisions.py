@@ -10,11 +10,11 @@ from service.base.errors import ConflictError
 from service.base.fields import MeasurementName, Model, Reason, Text, Version
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
-from service.twin.alerts.acknowledging import AlertFilter, acknowledge
-from service.twin.alerts.alerts import list_alerts
+from service.twin.alerts.acknowledging import acknowledge_surface
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
 from service.web.api.attention import AttentionCountDep
 from service.web.api.corrections import predict_again
+from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -96,34 +96,20 @@ def post_exclusion_form(
     return go_to(f"/heliostats/{name}#excluded-title")
 
 
-class AcknowledgeForm(Model):
-    """Why the warnings of a surface are acknowledged."""
-
-    reason: Reason
-
-
 @router.post(
     "/heliostats/{name}/surfaces/{version}/acknowledge", dependencies=[OPERATE, OVERVIEW_SLOT]
 )
 def post_acknowledge_form(
     name: NamePath,
     version: Annotated[Version, Path(description="Number of the version.")],
-    form: Annotated[AcknowledgeForm, Form()],
+    form: Annotated[SurfaceAcknowledgementIn, Form()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
     count: AttentionCountDep,
     identity: IdentityDep,
 ) -> Response:
     """Acknowledge that a surface is not trusted, as its alarm."""
-    with runtime.database.reading() as session:
-        store.get_surface(session, store.get_heliostat(session, name), version)
-        alerts = list_alerts(session, cache, runtime.settings).alerts
-    found = AlertFilter("untrusted", heliostat=name).choose(alerts)
-    if not found:
-        raise ConflictError(
-            f"heliostat {name}: its current surface has no warnings to acknowledge; reload the page"
-        )
-    acknowledge(runtime, cache, [one.id for one in found], identity.name, form.reason)
+    acknowledge_surface(runtime, cache, name, version, identity.name, form.reason)
     count.forget()
     return go_to(f"/heliostats/{name}#warnings-title")
 

@@ -47,8 +47,15 @@ from service.twin.alerts.field_overview import (
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.facets import facet_places
 from service.twin.pointing.calibration import CalibrationSlot, best_slot
-from service.twin.surfaces.accuracy import Comparison, ComparisonCache, ComparisonResult, rank_of
-from service.web.auth.dependencies import READ, FieldCacheDep, NamePath, RenderSlotDep, RuntimeDep
+from service.twin.surfaces.accuracy import Comparison, ComparisonResult, rank_of
+from service.web.auth.dependencies import (
+    READ,
+    ComparisonCacheDep,
+    FieldCacheDep,
+    NamePath,
+    RenderSlotDep,
+    RuntimeDep,
+)
 from service.web.pages.heliostat_charts import (
     accuracy_over_time,
     accuracy_values,
@@ -232,13 +239,6 @@ def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> Compa
     return ComparisonFigures(figures, flux, difference, largest if largest > bound else None)
 
 
-async def _comparisons(request: Request) -> ComparisonCache:
-    cache: ComparisonCache = request.app.state.comparisons
-    return cache
-
-
-ComparisonCacheDep = Annotated[ComparisonCache, Depends(_comparisons)]
-
 _UNDER_WAY = ComparisonResult(
     trouble="The forecasts of its photographs are being computed; reload the page in a moment."
 )
@@ -356,7 +356,7 @@ def _read(
     settings = runtime.settings
     with runtime.database.reading() as session:
         facts = causes.read_facts(session, line, row, surface, compared.comparisons, settings)
-        if causes.is_poor(session, facts, row, compared.comparisons, settings):
+        if facts is not None:
             likely, evidence = causes.rank_causes(facts), outlier_evidence(facts)
     return _HeliostatData(
         row,

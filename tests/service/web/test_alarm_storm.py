@@ -115,4 +115,4 @@ def test_evidence_that_a_field_was_added_and_not_photographed(tmp_path: Path):
         (cause,) = client.get(f"{PATH}/causes").json()["items"]
         assert cause["alerts"] == {"no_photograph": len(plant.heliostats)}
         assert cause["evidence"][0] == "no photograph with a known time was ever accepted"
-        assert cause["evidence"][1].startswith("the heliostats were added on ")
+        assert cause["evidence"][1].startswith("the heliostats were added at ")

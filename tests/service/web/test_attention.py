@@ -17,6 +17,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import URL, select, update
 
 from model.ephemeris import sun_angles_at
+from model.times import format_minute
 from service import store
 from service.base.settings import Settings
 from service.store import keys
@@ -101,7 +102,7 @@ def test_month_without_a_photograph(app: FastAPI, client: TestClient, post: Post
         session.execute(update(MeasurementRow).values(taken_at=long_ago))
     (item,) = items(client)
     assert (item["heliostat"], item["reason"]) == ("AA39", "no_photograph")
-    assert item["message"] == f"the last accepted one is of {long_ago:%Y-%m-%d}"
+    assert item["message"] == f"the last accepted one is of {format_minute(long_ago)}"
     assert datetime.fromisoformat(item["since"]) == pytest.approx(
         long_ago + timedelta(days=30), abs=timedelta(0.01)
     )
@@ -267,7 +268,9 @@ def test_moves_and_pointing_errors(calibrating: TestClient):
         if number == 7:
             calibrate(client)
     (moved,) = of(client, "moved")
-    assert moved["message"].startswith("it moved between 8 and 9 May 2024: its spot is ")
+    assert moved["message"].startswith(
+        "it moved between 2024-05-08 12:00 UTC and 2024-05-09 12:00 UTC: its spot is "
+    )
     assert datetime.fromisoformat(moved["since"]) == datetime(2024, 5, 9, 12, tzinfo=UTC)
     assert of(client, "pointing") == []  # one cause is reported once
     acknowledge(client, moved)

@@ -321,6 +321,12 @@ def test_photographs_are_excluded_with_a_reason_and_used_again(
     sent = {"photographs": ["1", "2"], "reason": "a cloud"}
     path = "/heliostats/AA39/exclusions"
     assert page.one("h2", id="causes-title").words == "Why is it bad"
+    causes = client.get("/v1/heliostats/AA39/causes").json()
+    assert not causes["pending"]
+    assert causes["items"]
+    for cause in causes["items"]:
+        assert f"{cause['label']}" in page.words
+        assert cause["evidence"] in page.words
     assert client.post(path, data={"photographs": ["1"]}).status_code == 422
     answer = client.post(path, data=sent, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"][-15:]) == (303, "#excluded-title")

@@ -58,6 +58,7 @@ WITHOUT_UNIT = {
     "attenuation",
     "blocking",
     "cosine",
+    "explained_share",
     "gear",
     "intercept",
     "mahalanobis_distance",

@@ -42,6 +42,10 @@ def predict(client: TestClient, method: str, *measurements: str) -> Any:
     return client.post(BASE, json={"method": method, "measurements": measurements}).json()
 
 
+def acknowledge(client: TestClient) -> Any:
+    return client.post(f"{BASE}/1/acknowledge", json={"reason": "snow"})
+
+
 def test_trusted_surface_says_so(client: TestClient):
     body = predict(client, "network", "1")
     assert (body["trusted"], body["warnings"], body["suspicious"], body["warned_since"]) == (
@@ -52,7 +56,7 @@ def test_trusted_surface_says_so(client: TestClient):
     )
     assert (body["mahalanobis_distance"], body["sun_span_deg"]) == (1.0, pytest.approx(0, abs=1e-4))
     assert 'heliotwin_surfaces{trusted="yes"} 1.0' in client.get("/metrics").text
-    assert client.post(f"{BASE}/1/acknowledge").status_code == 409
+    assert acknowledge(client).status_code == 409
 
 
 def test_warnings_are_shown_with_reasons_and_time(client: TestClient):
@@ -117,7 +121,7 @@ def test_acknowledgement_holds_while_the_warnings_are_the_same(client: TestClien
     kept = client.get(f"{BASE}/1").json()
     assert kept["acknowledged_by"] == "local"
     assert (
-        client.post(f"{BASE}/1/acknowledge").json()["acknowledged_at"] == kept["acknowledged_at"]
+        acknowledge(client).json()["acknowledged_at"] == kept["acknowledged_at"]
     )  # the first who did
     again = predict(client, "refined", "1", "2")
     assert (again["warned_since"], again["acknowledged_by"]) == (first["warned_since"], "local")

@@ -1,0 +1,68 @@
+"""Likely causes of a heliostat's poor forecasts."""
+
+from datetime import date, datetime
+
+from fastapi import APIRouter
+from pydantic import BaseModel, Field
+
+from service import store
+from service.base.fields import from_row
+from service.twin.alerts.causes import CauseKind, rank_causes, read_facts
+from service.twin.alerts.field_overview import read_summaries
+from service.twin.surfaces.accuracy import ComparisonResult
+from service.web.auth.dependencies import (
+    READ,
+    ComparisonCacheDep,
+    FieldCacheDep,
+    NamePath,
+    RuntimeDep,
+)
+from service.web.responses.openapi import problems
+from service.web.responses.paging import Page
+
+router = APIRouter(prefix="/heliostats/{name}/causes", tags=["heliostats"])
+
+
+class LikelyCauseOut(BaseModel):
+    """A likely cause of poor forecasts, with its evidence."""
+
+    kind: CauseKind = Field(description="Which cause it is.")
+    label: str = Field(description="The cause in words.")
+    explained_share: float = Field(
+        description="Share of the poor photographs, or of the shortfall, that it explains [1]."
+    )
+    evidence: str = Field(description="What the store knows of it.")
+    measurements: list[str] = Field(description="Ids of the measurements that show it.")
+    day: date | None = Field(description="The day of haze, in the plant's time zone.")
+    since: datetime | None = Field(description="When the mirror changed.")
+    study: int | None = Field(description="The study that found what the model lacks.")
+
+
+class LikelyCausePage(Page[LikelyCauseOut]):
+    """Likely causes, the one that explains most first; none for a good heliostat."""
+
+    pending: bool = Field(
+        description="Whether photographs are still being compared; accuracies on arrival are used."
+    )
+
+
+@router.get("", responses=problems(404), dependencies=[READ])
+def list_causes(
+    name: NamePath, runtime: RuntimeDep, cache: ComparisonCacheDep, field: FieldCacheDep
+) -> LikelyCausePage:
+    """Rank the likely causes of a heliostat's poor forecasts."""
+    with runtime.database.reading() as session:
+        row = store.get_heliostat(session, name)
+        surface = store.find_surface_at(session, row)
+        key, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
+    compared = ComparisonResult() if key is None else cache.wait_for(key)
+    line = field.with_pointing(line)
+    comparisons = () if compared is None else compared.comparisons
+    with runtime.database.reading() as session:
+        facts = read_facts(session, line, row, surface, comparisons, runtime.settings)
+        found = [] if facts is None else rank_causes(facts)
+    items = [
+        from_row(LikelyCauseOut, one, explained_share=one.share, measurements=list(one.photographs))
+        for one in found
+    ]
+    return LikelyCausePage(items=items, next=None, pending=compared is None)
