@@ -204,5 +204,5 @@ def test_page_corrects_and_excludes(known: TestClient):
     assert answer.headers["Location"] == "/jobs/1"
     assert "excluded" in known.get("/heliostats/AA39", headers=HTML).text
     history = known.get(path, headers=HTML).text
-    assert "<td>excluded</td>" in history
+    assert ">excluded</td>" in history
     assert "True" not in history
