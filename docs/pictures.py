@@ -148,7 +148,7 @@ def _take_page(path: str, name: str, height: int) -> None:
         for _ in range(2):
             run(
                 ["chromium", "--headless", "--no-sandbox", "--hide-scrollbars",
-                 "--virtual-time-budget=20000", f"--window-size=1280,{height}",
+                 "--virtual-time-budget=20000", f"--window-size=1440,{height}",
                  f"--screenshot={picture}", f"http://127.0.0.1:{PORT}{path}"],
                 check=True, capture_output=True,
             )  # fmt: skip
