@@ -2,7 +2,9 @@
 
 import re
 from collections.abc import Iterator
-from datetime import timedelta
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
@@ -31,9 +33,9 @@ from tests.service.web.pages import HTML, settled, text_of
 NAMES = ("AA39", "AA3", "AB01")
 
 
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    folder = tmp_path_factory.mktemp("home")
+@contextmanager
+def field_in(folder: Path) -> Iterator[TestClient]:
+    """A field of three heliostats without photographs."""
     settings = Settings(data_dir=folder, attention_photograph_days=1e-9, **QUIET)
     with client_of(create_app(settings, FakeOperations())) as client:
         assert client.put("/v1/plant", json=tower_document()).status_code == 200
@@ -43,6 +45,32 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
             assert client.put(f"/v1/heliostats/{name}", json=properties).status_code == 201
         client.headers.update(HTML)
         yield client
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    with field_in(tmp_path_factory.mktemp("home")) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def photographed(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[TestClient, dict[int, datetime]]]:
+    """The field with a surface and photographs of AA39, and their times by days ago."""
+    with field_in(tmp_path_factory.mktemp("photographed")) as client:
+        send, made = poster(client), {}
+        for seed, days in enumerate((50, 45, 10)):
+            at = (now() - timedelta(days=days)).replace(hour=11, minute=0)
+            azimuth, elevation = sun_angles_at(at, ORIGIN)
+            sun = {"azimuth_deg": azimuth, "elevation_deg": elevation}
+            answer = send(png(seed), id=f"10{seed}", taken_at=at.isoformat(), sun=sun)
+            assert answer.status_code == 201, answer.text
+            made[days] = at
+            if not seed:
+                body = {"measurements": ["100"]}
+                assert client.post("/v1/heliostats/AA39/surfaces", json=body).status_code == 201
+        yield client, made
 
 
 @pytest.mark.parametrize(
@@ -128,20 +156,13 @@ def tile(client: TestClient, label: str, period: str = "30") -> str:
     return ": ".join(one.words for one in parts).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def test_tiles_have_the_state_of_the_plant(home: TestClient):
+def test_tiles_of_a_field_without_photographs(home: TestClient):
     assert tile(home, "Alarms").endswith(": 0 act now, 0 act today, 3 when there is time")
     assert tile(home, "Mean").endswith(": no photograph was forecast in 30 days")
-    send, made = poster(home), {}
-    for seed, days in enumerate((50, 45, 10)):
-        at = (now() - timedelta(days=days)).replace(hour=11, minute=0)
-        azimuth, elevation = sun_angles_at(at, ORIGIN)
-        sun = {"azimuth_deg": azimuth, "elevation_deg": elevation}
-        answer = send(png(seed), id=f"10{seed}", taken_at=at.isoformat(), sun=sun)
-        assert answer.status_code == 201, answer.text
-        made[days] = at
-        if not seed:
-            body = {"measurements": ["100"]}
-            assert home.post("/v1/heliostats/AA39/surfaces", json=body).status_code == 201
+
+
+def test_tiles_have_the_state_of_the_plant(photographed: tuple[TestClient, dict[int, datetime]]):
+    home, made = photographed
     assert "100.0 % in 30 days, 100.0 % in those before" in tile(home, "Mean")
     assert "no photograph was forecast in 7 days" in tile(home, "Mean", "7")
     assert "in 90 days, nothing to compare before" in tile(home, "Mean", "90")
@@ -155,7 +176,10 @@ def test_tiles_have_the_state_of_the_plant(home: TestClient):
     assert page.one("input", name="period")["value"] == "7"  # the filter keeps it
 
 
-def test_comparison_with_one_surface_says_how_to_get_another(home: TestClient):
+def test_comparison_with_one_surface_says_how_to_get_another(
+    photographed: tuple[TestClient, dict[int, datetime]],
+):
+    home, _ = photographed
     page = text_of(home, "/compare?heliostat=AA39")
     assert "Heliostat AA39 has one surface only" in page.words
     assert "/jobs/start?heliostat=AA39" in page.links
@@ -164,7 +188,8 @@ def test_comparison_with_one_surface_says_how_to_get_another(home: TestClient):
     text_of(home, "/compare?heliostat=none", 404)
 
 
-def test_pictures_are_links(home: TestClient):
+def test_pictures_are_links(photographed: tuple[TestClient, dict[int, datetime]]):
+    home, _ = photographed
     for path in ("/heliostats/AA39/photographs/102", "/heliostats/AA39"):
         page = text_of(home, path)
         pictures = [one for one in page.all("img") if one.attributes.get("alt")]
