@@ -1,10 +1,10 @@
 """Measurement folders that were uploaded as ZIP files, stored until their import has ended."""
 
+import logging
 import re
 import secrets
 import shutil
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -20,6 +20,8 @@ from service.sources.folder import read_folder
 from service.store.job_tables import JobRow
 from service.store.jobs.queue import ENDED
 from service.twin.runtime.runtime import Runtime
+
+logger = logging.getLogger("heliotwin.jobs")
 
 _MAX_UPLOADS = 20
 # An upload without an import is deleted after so long [s].
@@ -77,9 +79,8 @@ def read_upload(path: Path) -> UploadedFolder:
 
 def delete_unused_uploads(runtime: Runtime) -> None:
     """Delete the uploads whose import has ended, and old ones that nobody imported."""
-    folders: list[Path] = []
-    with suppress(OSError):  # nothing was uploaded yet
-        folders = list(runtime.settings.uploads_dir.iterdir())
+    uploads = runtime.settings.uploads_dir
+    folders = list(uploads.iterdir()) if uploads.is_dir() else []
     if not folders:
         return
     name = JobRow.payload["folder"].as_string()
@@ -89,7 +90,10 @@ def delete_unused_uploads(runtime: Runtime) -> None:
     needed = {name for name, state in jobs if state not in ENDED}
     ended = {name for name, state in jobs} - needed
     for folder in folders:
-        with suppress(OSError):  # another process may delete it at the same time
+        try:
             is_old = time.time() - folder.stat().st_mtime > _UNUSED_S
             if folder.name in ended or (is_old and folder.name not in needed):
                 shutil.rmtree(folder)
+        except OSError as error:
+            if folder.exists():  # else another process deleted it at the same time
+                logger.error("upload %s is not deleted: %s", folder.name, error)

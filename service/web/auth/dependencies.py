@@ -37,6 +37,7 @@ async def _field(request: Request) -> FieldOverviewCache:
 
 
 FieldCacheDep = Annotated[FieldOverviewCache, Depends(_field)]
+"""The cache of what is computed once for each heliostat of the field."""
 
 
 async def _comparisons(request: Request) -> ComparisonCache:
@@ -45,7 +46,7 @@ async def _comparisons(request: Request) -> ComparisonCache:
 
 
 ComparisonCacheDep = Annotated[ComparisonCache, Depends(_comparisons)]
-"""The cache of what is computed once for each heliostat of the field."""
+"""The cache of forecasts compared with photographs."""
 
 # For the ``dependencies`` of a route: each requires at least this role.
 READ = Depends(Requires(Role.READ))
