@@ -41,7 +41,7 @@ serve: install ## the service on http://127.0.0.1:8000
 	$(BIN)/heliotwin serve $(ARGS)
 
 bench: install ## the short benchmarks, into results/, and their figures into RESULTS.md and README
-	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m benchmarks
 	$(BIN)/python -m docs.figures
 
 train: install ## the shipped weights from scratch: network, prior, export, evaluation; resumes what is in RUN

@@ -1,6 +1,6 @@
 """Measured figures in the documentation: ``python -m docs.figures`` writes RESULTS.md and README.
 
-Benchmarks write their figures to ``results/NAME.json`` (`tests.benchmarks.record`). A page names a
+Benchmarks write their figures to ``results/NAME.json`` (`benchmarks.record`). A page names a
 record, and its tables are inserted when the site is built:
 
     ```{figures} NAME

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("model", "service", "training")
+PACKAGES = ("model", "service", "training", "heliotwin", "migrations")
 MAX_PARAMETERS = 7
 MAX_CLASS_LINES = 150
 
@@ -115,7 +115,8 @@ def old_words() -> Counter[str]:
 
 def texts() -> Iterator[str]:
     """Code, pages and documents that people read; migrations and CHANGELOG name what was."""
-    folders = [ROOT / name for name in (*PACKAGES, "heliotwin", "tests", "docker", "docs")]
+    read = {*PACKAGES, "tests", "benchmarks", "docker", "docs"} - {"migrations"}
+    folders = [ROOT / name for name in read]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     paths |= {ROOT / name for name in ("README.md", "RESULTS.md", "Makefile")}
     for path in sorted(paths - QUOTING):
@@ -209,13 +210,13 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 48_500,
+    "lines of code": 50_300,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
-    "functions that return a bare tuple": 40,
-    f"classes above {MAX_CLASS_LINES} lines": 0,
-    "lines with latitude_deg": 18,
+    "functions that return a bare tuple": 43,
+    f"classes above {MAX_CLASS_LINES} lines": 1,
+    "lines with latitude_deg": 19,
     "names of a forecast request's fields": 22,
     "dict[str, Any] in service": 64,
 }

@@ -23,10 +23,10 @@ import pytest
 import torch
 from xdist.scheduler import LoadScopeScheduling
 
+from benchmarks import data_folder
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
 from service.cli.demo_plant import write_plant
-from tests.benchmarks import data_folder
 from tests.undeclared import camera
 from tests.waiting import WAIT_LIMIT_S
 from tests.watched import NotWatchedError, environment, watching

@@ -18,7 +18,7 @@ _MIN_PILE = 1.2e-4
 # limit.
 _LIMIT_SATURATED = 0.6
 # Real photographs with one side removed, up to half of their light, are forecast as well as whole
-# ones (tests/benchmarks/cut.py). From this value on the estimate no longer grows: more may be
+# ones (benchmarks/cut.py). From this value on the estimate no longer grows: more may be
 # missing than is visible.
 _LIMIT_CUT = 0.3
 _LIMIT_SECOND = 0.40

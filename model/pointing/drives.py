@@ -50,7 +50,7 @@ Mask = NDArray[np.bool_]
 class Noise:
     """Standard deviations of all that is not a parameter, and prior odds of changes.
 
-    The values maximise the evidence on half of the heliostats of `tests.benchmarks.pointing`. The
+    The values maximise the evidence on half of the heliostats of `benchmarks.pointing`. The
     second drive's jitter is the scatter of photographs within one hour beyond the noise of their
     spots: wind and backlash.
 

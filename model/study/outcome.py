@@ -35,7 +35,7 @@ SHARED = 0.02
 neutral.
 
 Examples are faint light that 8 bits round away, and the tracer's grid. Chosen by sets of known
-effects (`tests.benchmarks.study`), where the median error of most parameters is 0.2 to 2 %.
+effects (`benchmarks.study`), where the median error of most parameters is 0.2 to 2 %.
 """
 
 MAX_LISTED = 4

@@ -4,7 +4,7 @@ The service runs several computations at a time (``HELIOTWIN_PARALLEL_COMPUTATIO
 small steps: a matrix with hundreds of rows, or the transform of an image of 64 x 64 pixels. A
 library's threads would share such a step and spin until the last of them is done. If another
 process occupies a core, that last thread returns a time slice later, and every step waits for it.
-`tests.benchmarks.busy` measures this effect. Only a refinement fits two halves of its images in
+`benchmarks.busy` measures this effect. Only a refinement fits two halves of its images in
 parallel (`model.refinement`). These share no step.
 """
 

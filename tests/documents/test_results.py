@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 
+from benchmarks import record
+from benchmarks.record import Estimate, log_row, recording
 from docs import figures
-from tests.benchmarks import record
-from tests.benchmarks.record import Estimate, log_row, recording
 
 from .prose import DOCS, ROOT
 
@@ -137,7 +137,7 @@ def test_units_and_counts_are_in_the_head_or_in_the_rows():
 def test_every_benchmark_records_its_figures():
     programs = [
         path.stem
-        for path in (ROOT / "tests" / "benchmarks").glob("*.py")
+        for path in (ROOT / "benchmarks").glob("*.py")
         if '__name__ == "__main__"' in (text := path.read_text(encoding="utf-8"))
         and "recording(" not in text
     ]

@@ -1,4 +1,4 @@
-"""Every fault on both databases; ``python -m tests.benchmarks.faults`` prints what
+"""Every fault on both databases; ``python -m benchmarks.faults`` prints what
 comes of them.
 """
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.benchmarks.imaging import accuracy
+from benchmarks.imaging import accuracy
 
 __all__ = ["accuracy", "gaussian"]
 

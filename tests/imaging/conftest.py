@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.imaging import read_plant
 from model.plant import TargetPlane
-from tests.benchmarks.imaging import read_plant
 from tests.imaging import gaussian
 
 

@@ -1,4 +1,4 @@
-"""On photographs of the Solar Tower Juelich; ``python -m tests.benchmarks.imaging`` prints the full
+"""On photographs of the Solar Tower Juelich; ``python -m benchmarks.imaging`` prints the full
 figures.
 """
 
@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.imaging import correlation, data_folder, figures, main, read_case
 from model.errors import ImageRefusedError
 from model.imaging import Camera, measure
 from model.imaging.edges import find_sheet
 from model.locating import corner_places, homography_through, project
 from service.sources.decode import decode_image
-from tests.benchmarks.imaging import correlation, data_folder, figures, main, read_case
 
 
 @pytest.fixture(scope="module")

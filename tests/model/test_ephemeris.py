@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.sun import apart_mrad, dated
 from model.effects.sun_position import SunPosition
 from model.ephemeris import clock_faults, sun_angles_at, sun_positions
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.site import Site
 from service.sources.folder import read_folder
-from tests.benchmarks.sun import apart_mrad, dated
 
 PLACE = (50.913, 6.388, 87.0)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tests.benchmarks import data_folder
+from benchmarks import data_folder
 from tests.undeclared.plant import Target
 from tests.undeclared.world import World
 

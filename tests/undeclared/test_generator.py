@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from benchmarks.folders import read_photographs
 from model.ephemeris import sun_angles_at
 from model.forecast import View, align
 from model.frames import sun_direction
@@ -20,7 +21,6 @@ from model.plant_model import JUELICH_MODEL
 from model.study import FluxImage
 from service.cli.folder_store import open_folder
 from service.sources.folder import MeasurementFolder, read_folder
-from tests.benchmarks.folders import read_photographs
 from tests.undeclared import changes, sky
 from tests.undeclared.adapter import effects_of, write_folder
 from tests.undeclared.camera import drawn_sheet, empty_targets, real_sheet, sheet

@@ -1,4 +1,4 @@
-"""A small part of ``python -m tests.benchmarks.study``: effects that the model does not declare are
+"""A small part of ``python -m benchmarks.study``: effects that the model does not declare are
 found.
 """
 

@@ -38,7 +38,7 @@ Item = TypeVar("Item")
 _RECENT = 4
 
 # Largest saturated share of a spot's brighter half before other photographs are preferred.
-# Unsaturated photographs alone have too few sun positions (``python -m tests.benchmarks.light
+# Unsaturated photographs alone have too few sun positions (``python -m benchmarks.light
 # --consensus``, ``surfaces --only photographs``).
 _WHOLE = 0.3
 

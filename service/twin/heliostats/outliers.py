@@ -4,7 +4,7 @@ Causes are a neighbour's shadow, a cloud or another heliostat's light. The netwo
 surface from some of the photographs. This surface explains most photographs about equally well, and
 outliers far worse. Of 85 photographs of AA39 over two years, eight are outliers. The measured
 mirror explains the same eight worst, and the network did not see it (``python -m
-tests.benchmarks.light --consensus``).
+benchmarks.light --consensus``).
 """
 
 from collections.abc import Sequence

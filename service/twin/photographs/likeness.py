@@ -1,6 +1,6 @@
 """Detect on arrival whether a photograph fits another heliostat's surface much better.
 
-The limits were measured on real photographs: ``python -m tests.benchmarks.swaps``.
+The limits were measured on real photographs: ``python -m benchmarks.swaps``.
 """
 
 import logging

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.folders import read_readings
+from benchmarks.pointing import Plant, with_clock
 from model.effects import Since
 from model.effects.encoder_offset import EncoderOffset
 from model.errors import InvalidInputError
@@ -33,8 +35,6 @@ from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import calibrate_store, make_plan
 from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.importing import import_folder
-from tests.benchmarks.folders import read_readings
-from tests.benchmarks.pointing import Plant, with_clock
 from tests.service.cli.motor_folder import write, write_measurement
 from tests.service.conftest import QUIET, properties_document, tower_document
 from tests.service.spots import photographs

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from benchmarks import data_folder
 from model.frames import wgs84_to_enu
 from service.base.settings import Settings
 from service.sources.documents import read_targets
 from service.sources.paint_documents import azimuth_from_north
 from service.web.app import create_app
-from tests.benchmarks import data_folder
 from tests.service.conftest import client_of
 
 STJ = data_folder()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks import solarpilot
+from benchmarks import solarpilot
 
 pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 'peers'")
 

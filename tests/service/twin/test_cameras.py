@@ -18,7 +18,7 @@ from tests.service.web.pages import HTML
 
 SETTINGS = Settings()
 SPREAD = (0.16, 0.2, 0.17)
-"""How much days differ at Jülich's lower target (`python -m tests.benchmarks.cameras`)."""
+"""How much days differ at Jülich's lower target (`python -m benchmarks.cameras`)."""
 
 
 def days(

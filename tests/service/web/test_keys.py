@@ -522,7 +522,7 @@ def test_public_paths_are_limited_by_address(
 
 
 def test_public_limit_is_below_the_limit_of_keys():
-    """What the machine serves is measured by ``python -m tests.benchmarks.public``: 28
+    """What the machine serves is measured by ``python -m benchmarks.public``: 28
     /openapi.json a second.
     """
     fields = Settings.model_fields
