@@ -1,8 +1,8 @@
 """Do the tests notice small faults of the code? ``python -m benchmarks.mutants``.
 
-Of `model` and of `service`, some places of functions are drawn by a fixed seed. Each is changed in a
-copy of the repository, where the tests that cover its line are run: they should fail. Which tests
-cover a line is in ``.coverage``, which ``make coverage`` writes.
+A fixed seed draws places in functions of `model` and `service`. Each is changed in a copy of the
+repository, where the tests that cover its line are run: they should fail. Which tests cover a line
+is in ``.coverage``, which ``make coverage`` writes.
 
 Mutation operators are those of Offutt et al. (1996): comparisons, arithmetic and logical operators,
 constants, negated conditions and return values.
