@@ -94,7 +94,7 @@ async def _largest_frame(visitor: Visitor) -> httpx.Response:
 
 
 async def _field(visitor: Visitor) -> httpx.Response:
-    return await visitor.http.get(visitor.random.choice(["/v1/field", "/v1/attention", "/metrics"]))
+    return await visitor.http.get(visitor.random.choice(["/v1/field", "/v1/alarms", "/metrics"]))
 
 
 GREEDY: dict[str, tuple[str, Ask]] = {

@@ -43,7 +43,7 @@ from service.store.photographs.image_files import digest
 from service.store.recovery.backup import images_of
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
-from service.twin.alerts.field_overview import read_summaries
+from service.twin.alarms.field_overview import read_summaries
 from service.twin.photographs.ingest import measurement_row
 from service.twin.runtime import operations
 from tests.faults.harness import new_store

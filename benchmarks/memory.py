@@ -408,8 +408,8 @@ def inputs(root: Path) -> dict[str, Send]:
         "calibration plan of 20,000 heliostats": get(
             "/v1/calibration-plan?at=2026-06-21T09:00:00Z"
         ),
-        "field, attention and metrics of 20,000": get(
-            "/v1/field?limit=500", "/attention", "/metrics", "/"
+        "field, alarms and metrics of 20,000": get(
+            "/v1/field?limit=500", "/alarms", "/metrics", "/"
         ),
         "plan, 100 x 316 x 316": plan(100, 316, 4),
         "plan, 9 x 1024 x 1024": plan(9, 1024, 20),

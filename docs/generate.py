@@ -23,7 +23,7 @@ from service.base import settings as settings_module
 from service.base.settings import Settings
 from service.cli.main import app as command_line
 from service.sources.plant_schema import json_schema
-from service.twin.alerts.field_overview import FieldOverviewCache
+from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
 from service.web.app import create_app
 from service.web.auth.security import Role

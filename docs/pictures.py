@@ -120,10 +120,10 @@ def draw_second_plant(out: Path) -> None:
 def draw_console(out: Path) -> None:
     """Take pages of the field with faults, after all that they show is computed."""
     with _served(out / "store-field") as address:
-        while json.load(urlopen(f"{address}/v1/attention"))["pending"]:
+        while json.load(urlopen(f"{address}/v1/alarms"))["pending"]:
             time.sleep(1)
         _take_page("/", "console-field", 1000)
-        _take_page("/attention", "console-alarms", 1150)
+        _take_page("/alarms", "console-alarms", 1150)
         _take_page("/heliostats/R04-12", "console-heliostat", 1330)
 
 

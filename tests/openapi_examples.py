@@ -313,7 +313,7 @@ def study(record: Recorder) -> None:
 
 
 def administrate(record: Recorder, key: str) -> None:
-    """Jobs, alerts, the audit trail, sessions and probes."""
+    """Jobs, alarms, the audit trail, sessions and probes."""
     job = record.run(
         "post_measurements_job", "/v1/jobs/measurements", reason="the lens was cleaned"
     )
@@ -326,13 +326,13 @@ def administrate(record: Recorder, key: str) -> None:
     record.call("get_job_events", f"GET {path}/events", 204, headers=last)
     waiting = record.call("post_predictions_job", "POST /v1/jobs/predictions", 202, json={})
     record.call("cancel_job", f"POST /v1/jobs/{waiting['id']}/cancel")
-    alerts = record.call("list_attention", "GET /v1/attention")["items"]
-    ids = {"ids": [alerts[0]["id"]], "reason": "the camera is being repaired"}
-    record.call("post_acknowledgements", "POST /v1/attention/acknowledgements", json=ids)
-    path = "/v1/attention/acknowledgements"
+    alarms = record.call("list_alarms", "GET /v1/alarms")["items"]
+    ids = {"ids": [alarms[0]["id"]], "reason": "the camera is being repaired"}
+    record.call("post_acknowledgements", "POST /v1/alarms/acknowledgements", json=ids)
+    path = "/v1/alarms/acknowledgements"
     batches = record.call("list_acknowledgements", f"GET {path}")["items"]
-    record.call("list_attention_causes", "GET /v1/attention/causes")
-    record.call("list_attention_history", "GET /v1/attention/history")
+    record.call("list_alarm_causes", "GET /v1/alarms/causes")
+    record.call("list_alarm_history", "GET /v1/alarms/history")
     record.call("undo_acknowledgements", f"POST {path}/{batches[0]['id']}/undo")
     record.call("delete_target", "DELETE /v1/targets/upper-target", 204)
     record.call("delete_receiver", "DELETE /v1/receivers/upper-receiver", 204)

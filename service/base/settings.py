@@ -420,31 +420,31 @@ class DisplaySettings(_SettingsGroup):
             ) from error
 
 
-class AttentionSettings(_SettingsGroup):
-    """When a heliostat, a camera or the queue needs attention."""
+class AlarmSettings(_SettingsGroup):
+    """When a heliostat, a camera or the queue raises an alarm."""
 
-    attention_accuracy: float = Field(0.75, ge=0, le=1)
-    """Forecast accuracy below which a heliostat needs attention [1]."""
-    attention_accuracy_drop: float = Field(0.05, ge=0, le=1)
+    alarm_accuracy: float = Field(0.75, ge=0, le=1)
+    """Forecast accuracy below which a heliostat has an alarm [1]."""
+    alarm_accuracy_drop: float = Field(0.05, ge=0, le=1)
     """By how much more than this the accuracy of a heliostat's newest photographs must have fallen
-    [1], surely (95 %), for it to need attention."""
-    attention_light_loss: float = Field(0.2, gt=0, lt=1)
+    [1], surely (95 %), for an alarm."""
+    alarm_light_loss: float = Field(0.2, gt=0, lt=1)
     """The same for the share of light that its newest photographs have lost, compared with other
     heliostats on the same days [1]."""
-    attention_pointing_mrad: float = Field(3.0, gt=0, le=1000)
-    """Pointing error above which it does [mrad]."""
-    attention_moved_days: Days = 90.0
-    """For so long after it moved it does [days]."""
-    attention_photograph_days: float = Field(30.0, gt=0, le=36500)
-    """So long after its last accepted photograph it does [days]."""
-    attention_camera_ratio: float = Field(1.5, gt=1, le=100)
+    alarm_pointing_mrad: float = Field(3.0, gt=0, le=1000)
+    """Pointing error above which a heliostat has an alarm [mrad]."""
+    alarm_moved_days: Days = 90.0
+    """How long the alarm of a heliostat that moved lasts [days]."""
+    alarm_photograph_days: float = Field(30.0, gt=0, le=36500)
+    """Age of the last accepted photograph above which a heliostat has an alarm [days]."""
+    alarm_camera_ratio: float = Field(1.5, gt=1, le=100)
     """A camera changed where its photographs' signal, noise or sheet is that many times what it
     was."""
-    attention_camera_certainty: float = Field(6.0, gt=0, le=100)
+    alarm_camera_certainty: float = Field(6.0, gt=0, le=100)
     """How sure that must be [standard deviations, from day to day]."""
-    attention_camera_days: int = Field(5, ge=2, le=30)
+    alarm_camera_days: int = Field(5, ge=2, le=30)
     """Days with photographs since the change, and at least twice as many before it."""
-    attention_queue_s: float = Field(1800.0, gt=0, le=1e7)
+    alarm_queue_s: float = Field(1800.0, gt=0, le=1e7)
     """The queue is stuck where a job has waited for so long [s]."""
 
 
@@ -463,7 +463,7 @@ class MonitoringSettings(_SettingsGroup):
 
 class Settings(
     MonitoringSettings,
-    AttentionSettings,
+    AlarmSettings,
     DisplaySettings,
     RetentionSettings,
     JobSettings,

@@ -1,4 +1,4 @@
-"""Storage of acknowledged alerts, and of the history of alerts."""
+"""Storage of acknowledged alarms, and of the history of alarms."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from service.store.tables import HeliostatRow
 
 
 class Key(NamedTuple):
-    """What identifies an alert; ``heliostat`` is None for the plant."""
+    """What identifies an alarm; ``heliostat`` is None for the plant."""
 
     heliostat: str | None
     reason: str
@@ -27,7 +27,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class AcknowledgementBatch:
-    """Alerts that were acknowledged together, with the number of those of each reason."""
+    """Alarms that were acknowledged together, with the number of those of each reason."""
 
     id: int
     created_at: datetime
@@ -40,7 +40,7 @@ class AcknowledgementBatch:
 
 @dataclass(frozen=True)
 class AlarmHistory:
-    """An alert from its beginning to its end, with its acknowledgements, oldest first."""
+    """An alarm from its beginning to its end, with its acknowledgements, oldest first."""
 
     heliostat: str | None
     row: AlarmRow
@@ -70,7 +70,7 @@ def _key(heliostat: str | None, row: AcknowledgementRow | AlarmRow) -> Key:
 def acknowledge(
     session: Session, keys: Sequence[Key], actor: str, comment: str
 ) -> list[AcknowledgementRow]:
-    """Record that ``actor`` has seen alerts, as one batch. Earlier acknowledgements remain.
+    """Record that ``actor`` has seen alarms, as one batch. Earlier acknowledgements remain.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def acknowledge(
     batch = min((row.id for row in new.values()), default=None)
     for key, row in new.items():
         row.batch = batch
-        _audit(session, actor, "attention.acknowledged", key, comment=comment)
+        _audit(session, actor, "alarm.acknowledged", key, comment=comment)
     return [(rows | new)[key] for key in keys]
 
 
@@ -138,7 +138,7 @@ def undo(session: Session, batch: int, actor: str) -> list[Key]:
                 f"acknowledgement {batch} was undone by {row.undone_by}; acknowledge again"
             )
         row.undone_at, row.undone_by = now(), actor
-        _audit(session, actor, "attention.undone", key, acknowledgement=batch)
+        _audit(session, actor, "alarm.undone", key, acknowledgement=batch)
     return list(found)
 
 
@@ -172,7 +172,7 @@ def list_batches(
 
 
 def newest_batch(session: Session, heliostat: str, reason: str) -> AcknowledgementBatch | None:
-    """The newest batch with an alert of this reason that was not undone; None without one."""
+    """The newest batch with an alarm of this reason that was not undone; None without one."""
     numbers = [
         row.batch
         for key, row in acknowledged(session).items()
@@ -186,13 +186,13 @@ def newest_batch(session: Session, heliostat: str, reason: str) -> Acknowledgeme
 
 
 def open_alarms(session: Session) -> dict[Key, AlarmRow]:
-    """Return the alerts that are recorded as present."""
+    """Return the alarms that are recorded as present."""
     rows = session.execute(_alarms().where(AlarmRow.closed_at.is_(None)))
     return {_key(name, row): row for name, row in rows}
 
 
 def record_alarms(session: Session, present: Mapping[Key, tuple[str, datetime]]) -> None:
-    """Record which alerts are present, each with its message and since when.
+    """Record which alarms are present, each with its message and since when.
 
     Recorded ones that are not present are closed.
     """
@@ -220,7 +220,7 @@ def list_history(
     reason: str | None = None,
     heliostat: str | None = None,
 ) -> list[AlarmHistory]:
-    """Up to ``limit`` alerts older than record ``after``, the newest first."""
+    """Up to ``limit`` alarms older than record ``after``, the newest first."""
     query = _alarms().order_by(AlarmRow.id.desc()).limit(limit)
     if after is not None:
         query = query.where(AlarmRow.id < after)

@@ -109,9 +109,9 @@ class SessionRow(Base):
 
 
 class AcknowledgementRow(Base):
-    """An acknowledged alert of a heliostat or of the plant (`service.twin.alerts.alerts`).
+    """An acknowledged alarm of a heliostat or of the plant (`service.twin.alarms.alarms`).
 
-    It applies while the alert's fingerprint equals ``fingerprint``, until somebody undoes it.
+    It applies while the alarm's fingerprint equals ``fingerprint``, until somebody undoes it.
     Those of one ``batch`` were made together, with the reason ``comment``.
     """
 
@@ -130,7 +130,7 @@ class AcknowledgementRow(Base):
 
 
 class AlarmRow(Base):
-    """An alert of a heliostat or of the plant, from when it was first seen until it was gone.
+    """An alarm of a heliostat or of the plant, from when it was first seen until it was gone.
 
     ``since`` is when its reason began, which may be long before ``opened_at``.
     """

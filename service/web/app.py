@@ -17,8 +17,8 @@ from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Workers
 from service.store.database import Database
-from service.twin.alerts.counts import AlertCount
-from service.twin.alerts.field_overview import FieldOverviewCache
+from service.twin.alarms.counts import AlarmCount
+from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Operations, Runtime
 from service.twin.runtime.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache
@@ -111,7 +111,7 @@ def create_app(
             await to_thread.run_sync(require_fit, settings, runtime.database)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldOverviewCache(runtime)
-            app.state.attention = AlertCount(runtime, app.state.field)
+            app.state.alarms = AlarmCount(runtime, app.state.field)
             app.state.watchers = Watchers(runtime)
             app.state.comparisons = ComparisonCache(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
@@ -121,7 +121,7 @@ def create_app(
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)
-                await to_thread.run_sync(app.state.attention.close)
+                await to_thread.run_sync(app.state.alarms.close)
                 await to_thread.run_sync(app.state.field.close)
                 await to_thread.run_sync(app.state.comparisons.close)
         finally:

@@ -23,10 +23,10 @@ from service.store import sizes
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
-from service.twin.alerts.acknowledging import record_history
-from service.twin.alerts.alerts import Alert, list_alerts
-from service.twin.alerts.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
-from service.twin.alerts.reasons import REASONS
+from service.twin.alarms.acknowledging import record_history
+from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
+from service.twin.alarms.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import CameraChange
 
@@ -49,19 +49,19 @@ class StoreCollector(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Query the metrics in one transaction, and record which alerts came and went."""
+        """Query the metrics in one transaction, and record which alarms came and went."""
         try:
             with self._runtime.database.reading() as session:
                 found = [*_queue(session), *_sizes(session, self._runtime.settings)]
-                alerts = list_alerts(session, self._cache, self._runtime.settings)
-                found.append(_attention(alerts.alerts))
+                alarms = find_alarms(session, self._cache, self._runtime.settings)
+                found.append(_alarms(alarms.alarms))
                 cameras = self._cache.cameras.read(session, self._runtime.settings)
                 found.append(_cameras(cameras.changes))
                 found += self._cache.recent(
                     session, "metrics", partial(self._of_heliostats, session)
                 )
                 found.append(_drift(session, self._runtime.settings.metrics_heliostats))
-            record_history(self._runtime, alerts)
+            record_history(self._runtime, alarms)
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
             found = []
@@ -128,13 +128,13 @@ def _cameras(changes: Sequence[CameraChange]) -> Metric:
     return ratios
 
 
-def _attention(items: Sequence[Alert]) -> Metric:
+def _alarms(items: Sequence[Alarm]) -> Metric:
     counted = Counter(
         (item.reason, "no" if item.acknowledged_by is None else "yes") for item in items
     )
     family = GaugeMetricFamily(
-        "heliotwin_attention",
-        "What needs attention, and whether it was acknowledged.",
+        "heliotwin_alarms",
+        "Alarms by reason, and whether they were acknowledged.",
         labels=["reason", "severity", "acknowledged"],
     )
     for reason, seen in product(REASONS, ("no", "yes")):

@@ -162,8 +162,8 @@ def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
         assert of("firing")[0]["annotations"]["summary"].startswith(
             "1 heliostats have no recent photograph"
         )
-        (item,) = service.get("/v1/attention").json()["items"]
-        service.post("/v1/attention/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
+        (item,) = service.get("/v1/alarms").json()["items"]
+        service.post("/v1/alarms/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
         until(lambda: bool(of("resolved")), "its end is delivered")
 
 

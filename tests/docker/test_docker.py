@@ -24,8 +24,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from service.base.settings import Settings
-from service.twin.alerts.field_overview import FieldOverviewCache
-from service.twin.alerts.reasons import REASONS
+from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
 from service.web.store_metrics import registry
 from tests.docker.files import DOCKER, ROOT, SECRET, drawn_expressions
@@ -267,11 +267,11 @@ def test_rules_are_well_formed():
         assert rule["annotations"]["summary"]
 
 
-def test_every_reason_for_attention_has_its_alert():
+def test_every_alarm_reason_has_its_alert():
     asked = [
         (reason, rule["labels"]["severity"])
         for rule in _rules()
-        for reason in re.findall(r'heliotwin_attention{reason="(\w+)"', rule["expr"])
+        for reason in re.findall(r'heliotwin_alarms{reason="(\w+)"', rule["expr"])
     ]
     assert asked == [(reason, str(known.severity)) for reason, known in REASONS.items()]
     assert {rule["labels"]["severity"] for rule in _rules()} == {"1", "2", "3"}
@@ -475,8 +475,8 @@ import service, pathlib, sys
 assert pathlib.Path(service.__file__).is_relative_to(sys.argv[1]), service.__file__
 from service.store.database import migrate
 from service.web.store_metrics import registry
-from service.twin.alerts.field_overview import FieldOverviewCache
-from service.twin.alerts.reasons import REASONS
+from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
 from service.base.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))

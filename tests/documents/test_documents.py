@@ -8,7 +8,7 @@ from typer.main import get_command
 
 from service.base.settings import Settings
 from service.cli.main import app
-from service.twin.alerts.reasons import REASONS
+from service.twin.alarms.reasons import REASONS
 
 from .prose import DOCS, ROOT, pages, sentences, statistics_of
 
@@ -51,7 +51,7 @@ def test_links_of_the_readme_lead_to_files():
 
 
 def test_every_alarm_has_its_section_with_meaning_cause_and_action():
-    """The anchors are those that the page of alerts links to."""
+    """The anchors are those that the page of alarms links to."""
     text = (DOCS / "how-to" / "operator" / "alarms.md").read_text(encoding="utf-8")
     sections = re.findall(r"^\((\w+)\)=\n## (\w+):(.*?)(?=^\(|\Z)", text, re.MULTILINE | re.DOTALL)
     assert [anchor for anchor, _, _ in sections] == list(REASONS)
@@ -82,7 +82,7 @@ def test_settings_verbs_and_files_that_pages_name_exist():
 
 
 def test_anchors_of_alarms_are_those_of_the_built_page():
-    """Sphinx writes hyphens in them; the template of the alerts replaces them likewise."""
+    """Sphinx writes hyphens in them; the template of the alarms replaces them likewise."""
     built = ROOT / "build" / "docs" / "how-to" / "operator" / "alarms.html"
     if not built.exists():
         pytest.skip("the guide is not built: make docs")

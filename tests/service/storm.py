@@ -25,7 +25,7 @@ CLOCK, UNDATED = 187, 12
 
 def storm_app(folder: Path, **changes: Any) -> FastAPI:
     """A service whose queue counts as stuck at once."""
-    settings = Settings(data_dir=folder / "data", **QUIET | changes, attention_queue_s=1e-3)
+    settings = Settings(data_dir=folder / "data", **QUIET | changes, alarm_queue_s=1e-3)
     return create_app(settings, FakeOperations())
 
 

@@ -248,9 +248,7 @@ class PointingCache:
             with self._runtime.database.reading() as session:
                 mount = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
                 stored, newer = _newer(session, state.heliostat, mount)
-            return pointing_state(
-                stored, mount, newer, self._runtime.settings.attention_pointing_mrad
-            )
+            return pointing_state(stored, mount, newer, self._runtime.settings.alarm_pointing_mrad)
         except (ModelError, ServiceError) as error:
             logger.info(
                 "the pointing error of heliostat %s is not known: %s", state.heliostat, error

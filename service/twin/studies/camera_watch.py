@@ -82,7 +82,7 @@ class CameraChange:
 
 def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraChange | None:
     """The most certain change beyond the limits of the settings; None without any."""
-    days, least = sorted(daily), settings.attention_camera_days
+    days, least = sorted(daily), settings.alarm_camera_days
     values = np.array([daily[day] for day in days]).reshape(-1, len(FIGURES))
     found: list[CameraChange] = []
     for split in range(2 * least, len(days) - least + 1):
@@ -94,8 +94,8 @@ def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraC
             _OF_MEDIAN * spread * np.sqrt(1 / len(before) + 1 / len(after))
         )
         for figure, by, sure in zip(FIGURES, shift.tolist(), certainty.tolist(), strict=True):
-            if sure >= settings.attention_camera_certainty and abs(by) >= np.log(
-                settings.attention_camera_ratio
+            if sure >= settings.alarm_camera_certainty and abs(by) >= np.log(
+                settings.alarm_camera_ratio
             ):
                 counted = (len(before), len(after))
                 found.append(

@@ -445,9 +445,9 @@ def record_drift(
 ) -> None:
     """Store an accuracy as the heliostat's newest, unless a later photograph has one.
 
-    A photograph of unknown time is ignored. An accuracy below ``attention_accuracy`` is poor, and
+    A photograph of unknown time is ignored. An accuracy below ``alarm_accuracy`` is poor, and
     ``poor_since`` is when the current series of poor ones began. ``fell_since`` is the same for
-    drops whose lower limit exceeds ``attention_accuracy_drop``.
+    drops whose lower limit exceeds ``alarm_accuracy_drop``.
     """
     if measurement.taken_at is None:
         return
@@ -458,11 +458,11 @@ def record_drift(
         taken_at=measurement.taken_at,
         accuracy=accuracy,
     )
-    new.poor_since = new.taken_at if accuracy < settings.attention_accuracy else None
+    new.poor_since = new.taken_at if accuracy < settings.alarm_accuracy else None
     fall = accuracy_drop(_accuracies_on_arrival(session, measurement.heliostat_id))
     if fall is not None:
         new.recent, new.earlier, new.min_drop = fall.recent, fall.earlier, fall.low
-        new.fell_since = new.taken_at if fall.low > settings.attention_accuracy_drop else None
+        new.fell_since = new.taken_at if fall.low > settings.alarm_accuracy_drop else None
     held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held is None and store.insert(session, new):
         return

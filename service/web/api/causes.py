@@ -7,8 +7,8 @@ from pydantic import BaseModel, Field
 
 from service import store
 from service.base.fields import from_row
-from service.twin.alerts.causes import CauseKind, rank_causes, read_facts
-from service.twin.alerts.field_overview import read_summaries
+from service.twin.alarms.causes import CauseKind, rank_causes, read_facts
+from service.twin.alarms.field_overview import read_summaries
 from service.twin.surfaces.accuracy import ComparisonResult
 from service.web.auth.dependencies import (
     READ,

@@ -8,8 +8,8 @@ from pydantic import BaseModel, Field
 
 from service.base.errors import NotFoundError
 from service.base.fields import HeliostatOf, Name, Source
-from service.twin.alerts.field_filter import METRICS, HeliostatFilter, filter_heliostats
-from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview
+from service.twin.alarms.field_filter import METRICS, HeliostatFilter, filter_heliostats
+from service.twin.alarms.field_overview import PATIENCE_S, HeliostatOverview
 from service.web.auth.dependencies import OVERVIEW_SLOT, READ, FieldCacheDep, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page

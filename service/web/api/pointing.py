@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.errors import NotFoundError
 from service.base.fields import From, HeliostatOf, Name, UpTo
-from service.twin.alerts.field_overview import PATIENCE_S, HeliostatOverview, read_summaries
+from service.twin.alarms.field_overview import PATIENCE_S, HeliostatOverview, read_summaries
 from service.twin.pointing.calibration import best_slot
 from service.web.api.mounts import PlannedOut, planned_out
 from service.web.auth.dependencies import READ, FieldCacheDep, Limit, NamePath, RuntimeDep

@@ -36,11 +36,11 @@ from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
-from service.twin.alerts import acknowledging
+from service.twin.alarms import acknowledging
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
-from service.web.api.attention import AttentionCountDep
+from service.web.api.alarms import AlarmCountDep
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -429,13 +429,13 @@ def acknowledge_surface(
     version: Annotated[Version, Path(description="Number of the version, from 1.")],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
     body: Annotated[SurfaceAcknowledgementIn, Body()],
 ) -> SurfaceSummary:
-    """Acknowledge that the active surface is not trusted, as its alert.
+    """Acknowledge that the active surface is not trusted, as its alarm.
 
-    The answer is 409 if it is trusted. `POST /v1/attention/acknowledgements/{number}/undo` undoes
+    The answer is 409 if it is trusted. `POST /v1/alarms/acknowledgements/{number}/undo` undoes
     it.
     """
     acknowledging.acknowledge_surface(runtime, cache, name, version, identity.name, body.reason)

@@ -15,7 +15,7 @@ from fastapi import Depends, Path, Query, Request
 from service.base.errors import UnsupportedContentError
 from service.base.fields import MeasurementName, Name
 from service.jobs.kind import Kinds
-from service.twin.alerts.field_overview import FieldOverviewCache
+from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.auth.fair_limiter import FairLimiter

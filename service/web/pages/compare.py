@@ -41,7 +41,7 @@ from service.store.columns import EPOCH
 from service.store.listing import Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
-from service.twin.alerts.field_overview import SurfaceErrors, field_totals, surface_errors
+from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
 from service.twin.heliostats.facets import facet_places

@@ -10,9 +10,9 @@ from service.base.errors import ConflictError
 from service.base.fields import MeasurementName, Model, Reason, Text, Version
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
-from service.twin.alerts.acknowledging import acknowledge_surface
+from service.twin.alarms.acknowledging import acknowledge_surface
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
-from service.web.api.attention import AttentionCountDep
+from service.web.api.alarms import AlarmCountDep
 from service.web.api.corrections import predict_again
 from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
@@ -105,7 +105,7 @@ def post_acknowledge_form(
     form: Annotated[SurfaceAcknowledgementIn, Form()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> Response:
     """Acknowledge that a surface is not trusted, as its alarm."""

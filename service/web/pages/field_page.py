@@ -21,7 +21,7 @@ from service.drawing.charts import CONDITION, Scale
 from service.drawing.pictures import places_picture
 from service.drawing.templates import in_zone
 from service.store.tables import PlantRow
-from service.twin.alerts.field_filter import (
+from service.twin.alarms.field_filter import (
     CONDITIONS,
     METRICS,
     HeliostatFilter,
@@ -29,11 +29,11 @@ from service.twin.alerts.field_filter import (
     default_order,
     filter_heliostats,
 )
-from service.twin.alerts.field_overview import HeliostatOverview
-from service.twin.alerts.field_state import PERIODS, Period, field_accuracy, recent_work
-from service.twin.alerts.reasons import SEVERITIES
+from service.twin.alarms.field_overview import HeliostatOverview
+from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
+from service.twin.alarms.reasons import SEVERITIES
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.api.attention import AttentionCountDep
+from service.web.api.alarms import AlarmCountDep
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
 from service.web.responses.pages import go_to, render
 
@@ -296,7 +296,7 @@ def get_field(
     request: Request,
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     view: Annotated[FieldView, Query()],
 ) -> HTMLResponse:
     """The state of the field, its map with the filtered heliostats emphasized, and their table."""
@@ -307,7 +307,7 @@ def get_field(
         )
         zone = plant_time_zone(session, runtime.settings.time_zone)
     lines, chosen = now.lines, METRICS[view.metric]
-    limit, ends = runtime.settings.attention_accuracy, runtime.settings.map_scales[view.metric]
+    limit, ends = runtime.settings.alarm_accuracy, runtime.settings.map_scales[view.metric]
     found = filter_heliostats(lines, view)
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED

@@ -37,8 +37,8 @@ from service.store.photographs.groups import (
 from service.store.pointing import mounts
 from service.store.surfaces import decisions
 from service.store.tables import DecisionRow, HeliostatRow, MountRow, SurfaceRow
-from service.twin.alerts import causes
-from service.twin.alerts.field_overview import (
+from service.twin.alarms import causes
+from service.twin.alarms.field_overview import (
     FieldTotals,
     HeliostatOverview,
     field_totals,

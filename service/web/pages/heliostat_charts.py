@@ -55,19 +55,19 @@ def version_marks(surfaces: Sequence[SurfaceRow], prefix: str) -> list[tuple[dat
 
 
 def accuracy_over_time(series: Mapping[str, Sequence[Value]], settings: Settings) -> OverTime:
-    """Accuracies of forecasts, with the limit of alerts."""
+    """Accuracies of forecasts, with the limit of alarms."""
     title = "Forecast accuracy of photographs; hollow: the surface was made from it"
-    return OverTime(title, "%", series, 1, Threshold(100 * settings.attention_accuracy, True))
+    return OverTime(title, "%", series, 1, Threshold(100 * settings.alarm_accuracy, True))
 
 
 def pointing_over_time(series: Mapping[str, Sequence[Value]], settings: Settings) -> OverTime:
-    """Pointing errors, with the limit of alerts."""
+    """Pointing errors, with the limit of alarms."""
     return OverTime(
         "Pointing error of photographs that the mount was calibrated from",
         "mrad",
         series,
         2,
-        Threshold(settings.attention_pointing_mrad),
+        Threshold(settings.alarm_pointing_mrad),
     )
 
 

@@ -13,7 +13,7 @@ from service.drawing.facets import FacetPlaces
 from service.store.photographs.correction_log import list_corrections
 from service.store.photographs.groups import PhotographFilter, list_groups
 from service.store.tables import CorrectionRow, DecisionRow, HeliostatRow, SurfaceRow
-from service.twin.alerts.causes import HeliostatFacts, outlier_reasons
+from service.twin.alarms.causes import HeliostatFacts, outlier_reasons
 
 # Newest excluded photographs that can be used again from the page.
 _MAX_EXCLUDED = 5

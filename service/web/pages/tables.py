@@ -7,9 +7,9 @@ from fastapi import APIRouter, Query, Response
 
 from service import store
 from service.store.tables import MeasurementRow
-from service.twin.alerts.alerts import Alert, list_alerts
-from service.twin.alerts.field_filter import HeliostatFilter, filter_heliostats
-from service.twin.alerts.field_overview import PATIENCE_S, field_totals
+from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.field_filter import HeliostatFilter, filter_heliostats
+from service.twin.alarms.field_overview import PATIENCE_S, field_totals
 from service.twin.surfaces.accuracy import photograph_name
 from service.web.api.field_overview import FieldLine, field_line
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, NamePath, RuntimeDep
@@ -36,14 +36,14 @@ def get_field_table(
     return sheet_answer("field", columns, rows)
 
 
-@router.get("/attention.csv")
-def get_attention_table(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
-    """All alerts, acknowledged or not."""
+@router.get("/alarms.csv")
+def get_alarms_table(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
+    """All alarms, acknowledged or not."""
     with runtime.database.reading() as session:
-        items, _ = list_alerts(session, cache, runtime.settings)
-    columns = ["id", "severity", *(one.name for one in fields(Alert) if one.name != "fingerprint")]
+        items, _ = find_alarms(session, cache, runtime.settings)
+    columns = ["id", "severity", *(one.name for one in fields(Alarm) if one.name != "fingerprint")]
     return sheet_answer(
-        "attention", columns, ([getattr(item, name) for name in columns] for item in items)
+        "alarms", columns, ([getattr(item, name) for name in columns] for item in items)
     )
 
 

@@ -50,7 +50,7 @@ _TAGS = {
         " photograph."
     ),
     "jobs": "Work that outlives a request: ask for it, follow it, cancel it.",
-    "attention": "Alerts: what needs attention, and who has seen it.",
+    "alarms": "Alarms, and who has acknowledged them.",
     "audit": "Who did what when.",
     "session": "For pages: a session in a cookie.",
     "health": "For supervisors.",

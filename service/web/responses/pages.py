@@ -182,7 +182,7 @@ TEMPLATES = _environment()
 
 
 def count_badge(number: int) -> Markup:
-    """The number of alerts that are not acknowledged, for the menu; empty for none."""
+    """The number of alarms that are not acknowledged, for the menu; empty for none."""
     badge = '<span class="count">{}<span class="hidden"> not acknowledged</span></span>'
     return Markup(badge).format(number) if number else Markup("")
 
@@ -195,7 +195,7 @@ def _text(
         f"may_{role}": identity is not None and identity.role.includes(role)
         for role in (Role.OPERATE, Role.ADMIN)
     }
-    counted = getattr(getattr(scope.get("app"), "state", None), "attention", None)
+    counted = getattr(getattr(scope.get("app"), "state", None), "alarms", None)
     may["alarm_count"] = count_badge(0 if counted is None else counted.last)
     path, query = scope.get("path", ""), scope.get("query_string", b"").decode("ascii", "replace")
     rendering = _Rendering(quote(path) + (f"?{query}" if query else ""), zone)

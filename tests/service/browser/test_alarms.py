@@ -50,7 +50,7 @@ def test_operator_reduces_a_storm_to_its_causes(
         page.fill("[name=words]", words)
         follow(page, ".acknowledging button")
 
-    page.goto("/attention")
+    page.goto("/alarms")
     expect(page.locator("#causes-title")).to_have_text(
         "2 probable causes of 199 alarms, and 1 other"
     )
@@ -75,7 +75,7 @@ def test_operator_reduces_a_storm_to_its_causes(
     page.check("text=Tick all 12: times unknown")
     page.locator("[name=ids][value^='plant:queue']").check()
     acknowledge("Known; it can wait")
-    expect(page.locator("#attention")).to_contain_text("Nothing.")
+    expect(page.locator("#alarms")).to_contain_text("Nothing.")
     expect(page.locator("nav .count")).to_have_count(0)
     # Later it is undone from the history.
     follow(page, "text=History >> nth=-1")
@@ -85,6 +85,6 @@ def test_operator_reduces_a_storm_to_its_causes(
     for _ in range(2):
         follow(page, "#acknowledgements button >> nth=0")
     expect(page.locator("#acknowledgements button")).to_have_count(0)
-    page.goto("/attention")
+    page.goto("/alarms")
     expect(page.locator("#causes-title")).to_contain_text("of 199 alarms")
     context.close()

@@ -16,7 +16,7 @@ from tests.service.conftest import QUIET, FakeOperations, free_port, serving
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("home")
-    settings = Settings(data_dir=folder, port=free_port(), attention_photograph_days=1e-6, **QUIET)
+    settings = Settings(data_dir=folder, port=free_port(), alarm_photograph_days=1e-6, **QUIET)
     fill(create_app(settings, FakeOperations()))
     operations = GatedOperations()
     app = create_app(settings, operations)

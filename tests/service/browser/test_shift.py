@@ -58,9 +58,9 @@ PATHS = (
     "/forecast",
     "/forecasts/1",
     "/studies",
-    "/attention",
-    "/attention?sort=newest",
-    "/attention/history",
+    "/alarms",
+    "/alarms?sort=newest",
+    "/alarms/history",
     "/calibration-plan?at=2026-06-21T10:00",
     "/studies/1",
     "/studies/1/change",
@@ -267,7 +267,7 @@ def test_page_of_a_job_says_that_the_service_is_away_and_follows_it_when_it_is_b
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE])
-def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dict[str, int]):
+def test_operator_sees_alarms(page: Any, served: Served, size: dict[str, int]):
     with (
         served.app.state.runtime.database.writing() as session
     ):  # another day each time, that nobody has seen
@@ -275,7 +275,7 @@ def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dic
         session.execute(
             update(HeliostatRow).where(HeliostatRow.name == "AB01").values(created_at=now() - days)
         )
-    served.app.state.attention.forget()
+    served.app.state.alarms.forget()
     page.set_viewport_size(size)
     page.goto("/")
     expect(page.locator("nav .count")).to_have_text("1 not acknowledged")
@@ -284,7 +284,7 @@ def test_operator_sees_what_needs_attention(page: Any, served: Served, size: dic
     page.check("[name=ids]")
     page.select_option("[name=why]", "Maintenance")
     follow(page, ".acknowledging button")
-    expect(page.locator("#attention")).to_contain_text("Nothing.")
+    expect(page.locator("#alarms")).to_contain_text("Nothing.")
     expect(page.locator("nav .count")).to_have_count(0)
     follow(page, "text=Acknowledged (1)")
     expect(page.locator(".alarms tbody tr")).to_contain_text("acknowledged by local")

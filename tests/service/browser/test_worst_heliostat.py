@@ -35,7 +35,7 @@ def served(stj: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serv
     for image in add_photographs(years, plant, PHOTOGRAPHS):
         if image.name.startswith(VEILED):
             veil(image, 0.8)
-    changes = {"attention_accuracy": LIMIT, "port": free_port()}
+    changes = {"alarm_accuracy": LIMIT, "port": free_port()}
     with real.client_on(folder, **changes) as client:
         real.run_job(client, "/v1/jobs/imports", folder="plant")
     settings = real.settings_of(folder, job_workers=1, **changes)

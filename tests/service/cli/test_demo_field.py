@@ -33,9 +33,9 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         yield client
 
 
-def alerts_of(client: TestClient) -> list[dict[str, Any]]:
-    """All alerts, after the results behind them are computed."""
-    path = "/v1/attention?limit=500"
+def alarms_of(client: TestClient) -> list[dict[str, Any]]:
+    """All alarms, after the results behind them are computed."""
+    path = "/v1/alarms?limit=500"
     until(lambda: client.get(path).json()["pending"] == 0, "the field is computed")
     items: list[dict[str, Any]] = client.get(path).json()["items"]
     return items
@@ -44,7 +44,7 @@ def alerts_of(client: TestClient) -> list[dict[str, Any]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [f for f in FAULTS if f.alarm], ids=lambda fault: fault.kind)
 def test_faults_of_heliostats_raise_their_alarms(client: TestClient, fault: Fault):
-    found = {one["heliostat"] for one in alerts_of(client) if one["reason"] == fault.alarm}
+    found = {one["heliostat"] for one in alarms_of(client) if one["reason"] == fault.alarm}
     assert found == set(fault.heliostats)
 
 
@@ -53,7 +53,7 @@ def test_faults_of_heliostats_raise_their_alarms(client: TestClient, fault: Faul
     ("kind", "cause"), [("drives stepped", "It moved"), ("facet canted", "The mirror changed")]
 )
 def test_the_card_of_a_heliostat_ranks_its_fault(client: TestClient, kind: str, cause: str):
-    alerts_of(client)
+    alarms_of(client)
     (name,) = next(fault.heliostats for fault in FAULTS if fault.kind == kind)
     first, model = causes_of(client, name)
     assert first.startswith(cause)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.twin.alerts import field_overview
+from service.twin.alarms import field_overview
 from service.twin.runtime.background_cache import BackgroundCache
 from tests.service.conftest import FakeOperations, Post, png, sun_at
 from tests.waiting import WAIT_LIMIT_S, until

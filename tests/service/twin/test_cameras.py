@@ -87,12 +87,10 @@ def kept(app: FastAPI, changed: int) -> None:
 
 
 def of_camera(client: TestClient) -> list[dict[str, Any]]:
-    return [
-        item for item in client.get("/v1/attention").json()["items"] if item["reason"] == "camera"
-    ]
+    return [item for item in client.get("/v1/alarms").json()["items"] if item["reason"] == "camera"]
 
 
-def test_changed_camera_needs_attention_without_a_study(app: FastAPI, client: TestClient):
+def test_changed_camera_raises_an_alarm_without_a_study(app: FastAPI, client: TestClient):
     kept(app, 8)
     (item,) = of_camera(client)
     since = (now() - timedelta(days=8)).date()
@@ -105,8 +103,8 @@ def test_changed_camera_needs_attention_without_a_study(app: FastAPI, client: Te
         'heliotwin_camera_change_ratio{figure="sheet_share",target="lower"} '
         in client.get("/metrics").text
     )
-    assert "On lower the sheet&#39;s own pattern is " in client.get("/attention", headers=HTML).text
-    client.post("/v1/attention/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
+    assert "On lower the sheet&#39;s own pattern is " in client.get("/alarms", headers=HTML).text
+    client.post("/v1/alarms/acknowledgements", json={"ids": [item["id"]], "reason": "seen"})
     assert of_camera(client)[0]["acknowledged_by"] == "local"
 
 

@@ -105,7 +105,7 @@ def test_few_suns(stj: Path, years: Path, tmp_path: Path):
     lay_out(stj, tmp_path / "import" / "plant")
     shutil.rmtree(tmp_path / "import" / "plant" / "AA39" / "Deflectometry")
     add_photographs(years, tmp_path / "import" / "plant", ["100809", "100810", "100812"])
-    with real.client_on(tmp_path, attention_accuracy=0.999) as client:
+    with real.client_on(tmp_path, alarm_accuracy=0.999) as client:
         real.run_job(client, "/v1/jobs/imports", folder="plant")
         real.run_job(client, "/v1/jobs/predictions")
         add_photographs(years, tmp_path / "import" / "plant", ["218385"])

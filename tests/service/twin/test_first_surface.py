@@ -81,16 +81,16 @@ def test_its_own_photographs_make_an_active_surface(predicted: TestClient):
     assert predicted.get("/v1/heliostats/AA39/surfaces/decisions").json()["items"] == []
 
 
-def test_pages_and_attention_say_that_it_is_a_candidate(predicted: TestClient):
+def test_pages_and_alarms_say_that_it_is_a_candidate(predicted: TestClient):
     page = predicted.get("/heliostats/AB38", headers=HTML).text
     assert "No active surface" in page
     assert "The ideal mirror forecasts no worse" in page
     assert '<span class="state">candidate</span>' in page
     assert "version 1 is a candidate" in predicted.get("/", headers=HTML).text
-    flagged = {item["heliostat"]: item for item in predicted.get("/v1/attention").json()["items"]}
+    flagged = {item["heliostat"]: item for item in predicted.get("/v1/alarms").json()["items"]}
     assert flagged["AB38"]["reason"] == "untrusted"
     seen = predicted.post(
-        "/v1/attention/acknowledgements", json={"ids": [flagged["AB38"]["id"]], "reason": "seen"}
+        "/v1/alarms/acknowledgements", json={"ids": [flagged["AB38"]["id"]], "reason": "seen"}
     )
     assert seen.status_code == 200, seen.text
     assert predicted.get("/v1/heliostats/AB38/surfaces/1").json()["acknowledged_by"] == "local"

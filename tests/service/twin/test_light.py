@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from service.twin.alerts.light import find_lost_light
+from service.twin.alarms.light import find_lost_light
 from service.twin.studies.camera_watch import LightReading
 
 FIRST = datetime(2026, 5, 1, 10, tzinfo=UTC)

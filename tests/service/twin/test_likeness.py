@@ -1,5 +1,5 @@
-"""A photograph on arrival that is rather another heliostat's: warned of over REST, on pages and in
-attention.
+"""A photograph on arrival that is rather another heliostat's: warned of over REST, on pages and as
+an alarm.
 """
 
 import json
@@ -144,7 +144,7 @@ def test_a_photograph_that_fits_another_heliostat_is_warned_of(
     assert 'href="/heliostats/H02"' in page
     listed = client.get("/photographs?warned=true&heliostat=H00", headers=HTML).text
     assert "like H02" in listed
-    (item,) = client.get("/v1/attention?reason=unlike_heliostat").json()["items"]
+    (item,) = client.get("/v1/alarms?reason=unlike_heliostat").json()["items"]
     assert item["message"] == "1 measurement that another heliostat's surface forecasts much better"
 
 
@@ -163,7 +163,7 @@ def test_the_warning_holds_until_sun_or_target_change(
         assert bool(unlike(client.get(path).json())) == is_warned
     client.patch(path, json={"sun": sun_at(159.0), "reason": "typing"})
     assert unlike(client.get(path).json()) == []
-    assert client.get("/v1/attention?reason=unlike_heliostat").json()["items"] == []
+    assert client.get("/v1/alarms?reason=unlike_heliostat").json()["items"] == []
 
 
 def test_a_heliostat_that_is_usually_forecast_badly_is_not_warned_of(

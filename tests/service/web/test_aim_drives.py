@@ -43,10 +43,10 @@ def test_motors_are_those_of_the_calibrated_mount(client: TestClient, folder: Pa
     for name in ("A1", "C1"):
         assert "never calibrated" in before["drives"][name]["reason"]
     assert real.run_job(client, "/v1/jobs/calibrations", heliostats=["A1"])["mounts"] == {"A1": 1}
-    (alert,) = client.get("/v1/attention", params={"reason": "aims_outdated"}).json()["items"]
-    assert "A1" in alert["message"]
+    (alarm,) = client.get("/v1/alarms", params={"reason": "aims_outdated"}).json()["items"]
+    assert "A1" in alarm["message"]
     after = real.run_job(client, "/v1/jobs/aim-plans", **body)
-    assert client.get("/v1/attention", params={"reason": "aims_outdated"}).json()["items"] == []
+    assert client.get("/v1/alarms", params={"reason": "aims_outdated"}).json()["items"] == []
     assert after["drives"]["B1"]["axis_angles_deg"] is not None
     drive = after["drives"]["A1"]
     assert drive["reason"] is None

@@ -270,12 +270,12 @@ def test_a_wrong_day_is_refused_by_its_name(plant: TestClient, changes: dict[str
 
 def outdated(client: TestClient) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = client.get(
-        "/v1/attention", params={"reason": "aims_outdated"}
+        "/v1/alarms", params={"reason": "aims_outdated"}
     ).json()["items"]
     return found
 
 
-def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: TestClient):
+def test_a_change_since_todays_plan_raises_an_alarm_until_a_new_plan(plant: TestClient):
     noon = now().astimezone(ZoneInfo("Europe/Madrid")).replace(hour=13, minute=0, second=0)
     today = BODY | {"sun": {"at": noon.isoformat()}, "heliostats": some_names(plant)}
     job = real.done_job(plant, "/v1/jobs/aim-plans", **today)
@@ -286,13 +286,11 @@ def test_a_change_since_todays_plan_raises_an_alert_until_a_new_plan(plant: Test
     properties["position_m"][2] += 0.01
     with real.runtime_of(plant).database.writing() as session:
         setup.set_heliostat(session, "tester", name, properties)
-    (alert,) = outdated(plant)
-    assert f"plan {job['id']} of aims for today on main" in alert["message"]
-    assert f"properties of 1: {name}" in alert["message"]
+    (alarm,) = outdated(plant)
+    assert f"plan {job['id']} of aims for today on main" in alarm["message"]
+    assert f"properties of 1: {name}" in alarm["message"]
     metrics = plant.get("/metrics").text
-    assert (
-        'heliotwin_attention{acknowledged="no",reason="aims_outdated",severity="1"} 1.0' in metrics
-    )
+    assert 'heliotwin_alarms{acknowledged="no",reason="aims_outdated",severity="1"} 1.0' in metrics
     real.done_job(plant, "/v1/jobs/aim-plans", **today)
     assert outdated(plant) == []
 
@@ -361,7 +359,7 @@ def test_stopped_day_goes_on_with_its_step(plant: TestClient, monkeypatch: pytes
     assert (job["state"], len(job["result"]["steps"]), len(plans)) == ("done", 2, 3)
 
 
-def test_new_surface_and_new_model_raise_the_alert(real_client: TestClient):
+def test_new_surface_and_new_model_raise_the_alarm(real_client: TestClient):
     noon = now().astimezone(ZoneInfo("Europe/Berlin")).replace(hour=12, minute=0, second=0)
     body = {"target": "multi_focus_tower", "sun": {"at": noon.isoformat()}, "limit_w_m2": 60e3}
     job = real.done_job(real_client, "/v1/jobs/aim-plans", **body)
@@ -370,10 +368,10 @@ def test_new_surface_and_new_model_raise_the_alert(real_client: TestClient):
     choice = {"version": other.json()["items"][0]["version"], "reason": "better"}
     answer = real_client.put("/v1/heliostats/AA39/surfaces/current", json=choice)
     assert answer.status_code == 200, answer.text
-    (alert,) = outdated(real_client)
-    assert f"plan {job['id']} of aims for today" in alert["message"]
-    assert "surface of 1: AA39" in alert["message"]
+    (alarm,) = outdated(real_client)
+    assert f"plan {job['id']} of aims for today" in alarm["message"]
+    assert "surface of 1: AA39" in alarm["message"]
     (study,) = real_client.get("/v1/studies").json()["items"]
     assert real_client.post(f"/v1/studies/{study['id']}/adopt", json=real.REASON).status_code == 201
-    (alert,) = outdated(real_client)
-    assert "model" in alert["message"]
+    (alarm,) = outdated(real_client)
+    assert "model" in alarm["message"]

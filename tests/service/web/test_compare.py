@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 
 from model.surface import greville
 from service.drawing.timelines import Value, timeline
-from service.twin.alerts.field_overview import surface_errors
+from service.twin.alarms.field_overview import surface_errors
 from tests.service.conftest import FakeOperations, Post, png, sun_at
 from tests.service.web.pages import HTML, settled, text_of
 

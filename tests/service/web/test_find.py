@@ -15,9 +15,9 @@ from service import store
 from service.base.settings import Settings
 from service.store.database import Database
 from service.store.surfaces.surface_versions import NewSurface, Trust
-from service.twin.alerts import field_overview
-from service.twin.alerts.field_filter import HeliostatFilter, filter_heliostats
-from service.twin.alerts.field_overview import (
+from service.twin.alarms import field_overview
+from service.twin.alarms.field_filter import HeliostatFilter, filter_heliostats
+from service.twin.alarms.field_overview import (
     ActiveSurface,
     FieldOverviewCache,
     FieldTotals,

@@ -97,7 +97,7 @@ def test_one_key_does_not_fill_the_line_before_the_model(
 
 
 def test_requests_for_the_whole_field_have_separate_slots(client: TestClient, app: FastAPI):
-    paths = ("/v1/field", "/v1/attention", "/attention", "/metrics")
+    paths = ("/v1/field", "/v1/alarms", "/alarms", "/metrics")
     assert [client.get(path).status_code for path in paths] == [200] * 4
     with _none_left(client, app, "overview_limiter"):
         assert [client.get(path).status_code for path in paths] == [503] * 4

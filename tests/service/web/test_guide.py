@@ -6,7 +6,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.twin.alerts.reasons import REASONS
+from service.twin.alarms.reasons import REASONS
 from service.web.responses import pages
 from service.web.root import documentation
 from tests.service.access import bearer, make_key

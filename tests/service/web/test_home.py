@@ -13,8 +13,8 @@ from model.ephemeris import sun_angles_at
 from service.base.settings import Settings
 from service.drawing.templates import ASSETS
 from service.store.columns import now
-from service.twin.alerts.field_overview import HeliostatOverview
-from service.twin.alerts.field_state import FieldAccuracy, field_accuracy
+from service.twin.alarms.field_overview import HeliostatOverview
+from service.twin.alarms.field_state import FieldAccuracy, field_accuracy
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from service.web.pages.field_page import STEPS
@@ -36,7 +36,7 @@ NAMES = ("AA39", "AA3", "AB01")
 @contextmanager
 def field_in(folder: Path) -> Iterator[TestClient]:
     """A field of three heliostats without photographs."""
-    settings = Settings(data_dir=folder, attention_photograph_days=1e-9, **QUIET)
+    settings = Settings(data_dir=folder, alarm_photograph_days=1e-9, **QUIET)
     with client_of(create_app(settings, FakeOperations())) as client:
         assert client.put("/v1/plant", json=tower_document()).status_code == 200
         for place, name in enumerate(NAMES):
@@ -95,14 +95,14 @@ def test_search_leads_to_the_heliostat_or_to_those_that_match(
 def test_every_page_has_alarms_first_search_and_a_banner(home: TestClient, path: str, status: int):
     page = text_of(home, path, status)
     first = page.one("nav", aria_label="Pages").all("a")[0]
-    assert (first["href"], first.words.split()[0]) == ("/attention", "Alarms")
+    assert (first["href"], first.words.split()[0]) == ("/alarms", "Alarms")
     forms = [form["action"] for form in page.all("form", role="search")]
     assert forms.count("/find") == (2 if status == 404 else 1)
     assert "everybody on this machine" in page.one("aside", class_="banner").words
 
 
 def test_menu_has_the_count_of_alarms_without_scripts(home: TestClient):
-    assert home.get("/attention/count").text
+    assert home.get("/alarms/count").text
     menu = text_of(home, "/").one("nav", aria_label="Pages")
     assert menu.one("span", class_="count").words == f"{len(NAMES)} not acknowledged"
 

@@ -71,7 +71,7 @@ def listed(client: TestClient, query: str = "") -> list[str]:
 
 
 def reasons(client: TestClient) -> set[str]:
-    return {item["reason"] for item in client.get("/v1/attention").json()["items"]}
+    return {item["reason"] for item in client.get("/v1/alarms").json()["items"]}
 
 
 # --- what is sent
@@ -133,7 +133,7 @@ def test_times_order_photographs_and_surfaces_however_late_they_come(
 
 @promise(
     "lists by time have the photograph last, and no filter by time finds it",
-    "attention asks for times",
+    "alarms asks for times",
 )
 def test_without_a_time_lists_by_time_have_it_last(client: TestClient, post: Post):
     post(png(1), id="undated")

@@ -67,7 +67,7 @@ PATHS = (
     "/forecast?heliostat=H2999",
     "/forecasts/1",
     "/heliostats/H0000",
-    "/attention",
+    "/alarms",
     "/jobs",
     "/jobs/1",
     "/studies",
@@ -173,20 +173,20 @@ def test_results_of_a_large_field_are_reused_for_a_while(
         lambda lines, wanted: (computed.append("field"), lines)[1],
     )
     monkeypatch.setattr(
-        "service.twin.alerts.alerts.alerts_of_heliostats",
-        lambda *arguments: (computed.append("attention"), [])[1],
+        "service.twin.alarms.alarms.alarms_of_heliostats",
+        lambda *arguments: (computed.append("alarms"), [])[1],
     )
     for path in (
         "/v1/field",
         "/v1/field?limit=2",
-        "/v1/attention",
-        "/attention",
-        "/attention/count",
+        "/v1/alarms",
+        "/alarms",
+        "/alarms/count",
         "/metrics",
     ):
         for _ in range(3):
             assert large.get(path).status_code == 200, path
-    assert sorted(computed) == ["attention", "field"]
+    assert sorted(computed) == ["alarms", "field"]
     poster(large)(png(2), heliostat="H0001")
     large.get("/v1/field")
-    assert sorted(computed) == ["attention", "field", "field"]
+    assert sorted(computed) == ["alarms", "field", "field"]

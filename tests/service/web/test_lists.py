@@ -54,9 +54,9 @@ def test_every_list_is_a_page(bare: TestClient):
         "studies",
         "jobs",
         "models",
-        "attention",
-        "attention/acknowledgements",
-        "attention/history",
+        "alarms",
+        "alarms/acknowledgements",
+        "alarms/history",
         "audit",
     ):
         assert f"/v1/{name}" in pages
@@ -118,7 +118,7 @@ def test_known_query_parameters_pass(refusing: TestClient):
     for path in (
         "field?show=trusted&sort=name&order=up",
         "heliostats?limit=3",
-        "attention?reason=camera",
+        "alarms?reason=camera",
     ):
         assert refusing.get(f"/v1/{path}").status_code == 200, path
 

@@ -38,7 +38,7 @@ TAGS = (
     "mounts",
     "studies",
     "jobs",
-    "attention",
+    "alarms",
     "audit",
     "session",
     "health",

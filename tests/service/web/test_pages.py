@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from service.store.jobs.queue import get_job
-from service.twin.alerts.field_filter import METRICS
+from service.twin.alarms.field_filter import METRICS
 from service.web.app import create_app
 from service.web.auth import security
 from service.web.pages.login import own_path
@@ -316,7 +316,7 @@ def test_forecast_form_says_what_is_wrong(shown: TestClient, changes: dict[str, 
     assert said in answer.text
     assert "<h1" in answer.text
     part = shown.post("/forecast", data=form(**changes), headers=HTMX)
-    assert part.text.startswith('<p class="alert" role="alert">')
+    assert part.text.startswith('<p class="alarm" role="alarm">')
     assert part.headers["HX-Retarget"] == "#notice"
 
 

@@ -128,10 +128,10 @@ def test_tables_say_what_pages_say(shown: TestClient):
     ]
 
 
-def test_attention_as_a_table(client: TestClient, post: Post):
+def test_alarms_as_a_table(client: TestClient, post: Post):
     post(png(1), id="1", taken_at="2024-06-03T11:30:00Z")
-    assert 'href="/attention.csv"' in client.get("/attention", headers=HTML).text
-    rows = sheet(client, "/attention.csv")
+    assert 'href="/alarms.csv"' in client.get("/alarms", headers=HTML).text
+    rows = sheet(client, "/alarms.csv")
     assert [(row["reason"], row["heliostat"], row["acknowledged_by"]) for row in rows] == [
         ("sun_contradicts_time", "AA39", ""),
         ("no_photograph", "AA39", ""),

@@ -67,10 +67,10 @@ def test_an_undone_change_stays_so_while_alarms_are_undone(
     number = client.get("/v1/audit").json()["items"][0]["id"]
     client.post(f"{PATH}/{number}/undo", headers=HTML)
     for _ in range(51):
-        ids = [item["id"] for item in client.get("/v1/attention").json()["items"][:1]]
+        ids = [item["id"] for item in client.get("/v1/alarms").json()["items"][:1]]
         body = {"ids": ids, "reason": "known"}
-        done = client.post("/v1/attention/acknowledgements", json=body).json()["items"][0]
-        client.post(f"/v1/attention/acknowledgements/{done['acknowledgement']}/undo")
+        done = client.post("/v1/alarms/acknowledgements", json=body).json()["items"][0]
+        client.post(f"/v1/alarms/acknowledgements/{done['acknowledgement']}/undo")
     assert f"{PATH}/{number}/undo" not in client.get(PATH, headers=HTML).text
 
 

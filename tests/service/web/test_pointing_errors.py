@@ -132,7 +132,7 @@ def test_photographs_without_a_time_say_of_no_move(
     known = client.get(PATH).json()
     assert (known["since_calibration"], known["moved"], known["error_mrad"]) == (0, None, None)
     assert client.get("/v1/heliostats/AA39/mounts/current").json()["steps"] == []
-    assert client.get("/v1/attention", params={"reason": "moved"}).json()["items"] == []
+    assert client.get("/v1/alarms", params={"reason": "moved"}).json()["items"] == []
 
 
 def test_a_growing_error_has_a_trend(client: TestClient, post: Post, tower: Any, properties: Any):

@@ -94,9 +94,9 @@ def test_warnings_are_shown_with_reasons_and_time(client: TestClient):
         assert "hotograph 2 is not explained: 31% of it is missed" in html_page
     assert "Acknowledge</button>" in page
     # Both lead to where the photograph is corrected or excluded.
-    (item,) = client.get("/v1/attention?reason=untrusted").json()["items"]
+    (item,) = client.get("/v1/alarms?reason=untrusted").json()["items"]
     assert (item["measurements"], item["action"][:20]) == (["2"], "look at photograph 2")
-    for html_page in (page, client.get("/attention", headers=HTML).text):
+    for html_page in (page, client.get("/alarms", headers=HTML).text):
         assert '<a href="/heliostats/AA39/photographs/2">2</a>' in html_page
     assert (
         "Excluded: nothing is made from it"
@@ -111,8 +111,8 @@ def test_acknowledgement_holds_while_the_warnings_are_the_same(client: TestClien
     for is_first in (True, False):  # it is undone once
         page = client.post(path, data={"reason": "dew on it"}, headers=HTML).text
         assert re.search(r"Acknowledged by local, .*: dew on it\.", page)
-        (undo,) = re.findall(r'action="(/attention/acknowledgements/.*?)"', page)
-        (item,) = client.get("/v1/attention?reason=untrusted").json()["items"]
+        (undo,) = re.findall(r'action="(/alarms/acknowledgements/.*?)"', page)
+        (item,) = client.get("/v1/alarms?reason=untrusted").json()["items"]
         assert item["acknowledged_reason"] == "dew on it"
         if is_first:
             page = client.post(undo.replace("&amp;", "&"), headers=HTML).text

@@ -101,28 +101,28 @@ def test_a_time_is_null_and_never_1970(imported: TestClient, tmp_path: Path):
     assert item["properties"]["start_datetime"] < item["properties"]["end_datetime"]
 
 
-def attention(client: TestClient, reason: str) -> list[dict[str, Any]]:
-    return list(client.get(f"/v1/attention?reason={reason}").json()["items"])
+def alarms_of(client: TestClient, reason: str) -> list[dict[str, Any]]:
+    return list(client.get(f"/v1/alarms?reason={reason}").json()["items"])
 
 
-def test_attention_asks_for_times_and_goes_by_those_that_are_known(
+def test_alarm_asks_for_times_and_goes_by_those_that_are_known(
     app: FastAPI, client: TestClient, post: Post
 ):
     post(png(1), id="1")
-    (item,) = attention(client, "times_unknown")
+    (item,) = alarms_of(client, "times_unknown")
     assert "the time of its one accepted photograph is unknown" in item["message"]
     assert "PATCH /v1/measurements/times" in item["action"]
-    assert attention(client, "no_photograph") == []
+    assert alarms_of(client, "no_photograph") == []
     last = now() - timedelta(days=365)
     post(png(2), id="2", taken_at=last.isoformat())
     post(png(3), id="3")
-    (item,) = attention(client, "no_photograph")  # that some came today says nothing
+    (item,) = alarms_of(client, "no_photograph")  # that some came today says nothing
     assert (
         item["message"]
         == f"the last accepted one is of {format_minute(last)}; the time of 2 more is unknown"
     )
-    assert attention(client, "times_unknown") == []
-    assert "Times unknown:" not in client.get("/attention", headers=HTML).text
+    assert alarms_of(client, "times_unknown") == []
+    assert "Times unknown:" not in client.get("/alarms", headers=HTML).text
 
 
 def test_undated_photographs_are_no_news(client: TestClient, post: Post):
@@ -168,7 +168,7 @@ def test_times_are_given_in_bulk_as_corrections(
     )
     actions = [item["action"] for item in client.get("/v1/audit").json()["items"]]
     assert actions[:2] == ["times.corrected", "measurement.corrected"]
-    assert attention(client, "times_unknown") == []
+    assert alarms_of(client, "times_unknown") == []
 
 
 def test_one_wrong_entry_keeps_all_times_out(client: TestClient, post: Post):
@@ -238,11 +238,11 @@ def test_a_sun_that_contradicts_its_time_is_a_warning_everywhere(client: TestCli
     assert "/photographs/2" in page
     assert "/photographs/1" not in page
     assert "sun contradicts time" in page
-    (item,) = attention(client, "sun_contradicts_time")
+    (item,) = alarms_of(client, "sun_contradicts_time")
     assert (item["heliostat"], item["message"]) == (
         "AA39",
         "1 measurement with a sun that contradicts the time",
     )
     right = {"reason": "typing", "sun": sun_at(azimuth, elevation)}
     assert client.patch(f"{BASE}/2", json=right).json()["measurement"]["warnings"] == []
-    assert attention(client, "sun_contradicts_time") == []
+    assert alarms_of(client, "sun_contradicts_time") == []

@@ -25,7 +25,7 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
-from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.outliers import list_outliers
 from service.twin.plant import model_versions
@@ -434,13 +434,13 @@ def read_facts(
     drift = session.get(DriftRow, row.id)
     fall = _fall(drift, settings)
     accuracies = [rank_of(comparisons).accuracy, None if drift is None else drift.accuracy]
-    is_below = any(one is not None and one < settings.attention_accuracy for one in accuracies)
+    is_below = any(one is not None and one < settings.alarm_accuracy for one in accuracies)
     has_warnings = any(one.warnings for one in photographs)
     if not (is_below or fall or has_warnings or _has_alarm(line)):
         return None
     days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
     return HeliostatFacts(
-        settings.attention_accuracy,
+        settings.alarm_accuracy,
         photographs,
         line,
         {
@@ -458,7 +458,7 @@ def read_facts(
 
 
 def _fall(drift: DriftRow | None, settings: Settings) -> Fall | None:
-    if drift is None or (drift.min_drop or 0.0) <= settings.attention_accuracy_drop:
+    if drift is None or (drift.min_drop or 0.0) <= settings.alarm_accuracy_drop:
         return None
     return Fall(drift.fell_since or drift.taken_at, drift.recent or 0.0, drift.earlier or 0.0)
 

@@ -1,4 +1,4 @@
-"""Reasons of alerts: their labels and severities."""
+"""Reasons of alarms: their labels and severities."""
 
 from typing import Literal, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Pages of alerts: what is wrong, since when, what to do, who acknowledged it, and the history."""
+"""Pages of alarms: what is wrong, since when, what to do, who acknowledged it, and the history."""
 
 from operator import attrgetter
 from typing import Annotated, Literal, Self, get_args
@@ -11,17 +11,17 @@ from pydantic import Field, model_validator
 from service.base.errors import ConflictError
 from service.base.fields import Model, Name, Text, Version, drop_empty_fields
 from service.store import acknowledgements
-from service.twin.alerts.acknowledging import (
-    AlertFilter,
+from service.twin.alarms.acknowledging import (
+    AlarmFilter,
     acknowledge,
-    group_alerts,
+    group_alarms,
     read_history,
     undo_acknowledgement,
 )
-from service.twin.alerts.alerts import Alert, list_alerts
-from service.twin.alerts.common_causes import find_common_causes
-from service.twin.alerts.reasons import REASONS, SEVERITIES, Reason
-from service.web.api.attention import AttentionCountDep, ItemId
+from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.common_causes import find_common_causes
+from service.twin.alarms.reasons import REASONS, SEVERITIES, Reason
+from service.web.api.alarms import AlarmCountDep, ItemId
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
@@ -34,7 +34,7 @@ from service.web.responses.pages import count_badge, go_to, render
 
 router = APIRouter(include_in_schema=False)
 
-# Alerts that the page lists of one reason, or in total if it is sorted otherwise.
+# Alarms that the page lists of one reason, or in total if it is sorted otherwise.
 _LISTED = 100
 
 # Acknowledgements that the history lists.
@@ -54,7 +54,7 @@ COMMENTS: tuple[Comment, ...] = get_args(Comment)
 Sort = Literal["severity", "newest", "oldest", "heliostat"]
 
 
-class AttentionQuery(Model):
+class AlarmQuery(Model):
     """Filters and order of the page. ``done`` is an acknowledgement that was made just now."""
 
     severity: Annotated[int | None, Field(ge=1, le=3)] = None
@@ -66,7 +66,7 @@ class AttentionQuery(Model):
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
-    def link(self, path: str = "/attention", **changes: object) -> str:
+    def link(self, path: str = "/alarms", **changes: object) -> str:
         """The URL of ``path`` with these filters, and with changes."""
         values = self.model_dump(exclude_defaults=True, exclude={"done"}) | changes
         defaults = {None, False, "severity"}
@@ -82,12 +82,12 @@ class AttentionQuery(Model):
         """Whether only some reasons, severities or heliostats are wanted."""
         return any((self.severity, self.reason, self.heliostat))
 
-    def choose(self, alerts: list[Alert]) -> list[Alert]:
-        """The wanted alerts in the wanted order."""
-        wanted = AlertFilter(self.reason, self.severity, self.heliostat, self.acknowledged)
-        chosen = wanted.choose(alerts)
+    def choose(self, alarms: list[Alarm]) -> list[Alarm]:
+        """The wanted alarms in the wanted order."""
+        wanted = AlarmFilter(self.reason, self.severity, self.heliostat, self.acknowledged)
+        chosen = wanted.choose(alarms)
         if self.sort == "heliostat":
-            return sorted(chosen, key=lambda alert: alert.heliostat or "")
+            return sorted(chosen, key=lambda alarm: alarm.heliostat or "")
         if self.sort == "severity":
             return chosen
         return sorted(chosen, key=attrgetter("since"), reverse=self.sort == "newest")
@@ -105,11 +105,11 @@ class HistoryQuery(Model):
     def older(self, after: int) -> str:
         """The URL of what is older than record ``after``."""
         asked = self.model_dump(exclude_none=True) | {"after": after}
-        return f"/attention/history?{urlencode(asked)}"
+        return f"/alarms/history?{urlencode(asked)}"
 
 
 class AcknowledgementForm(Model):
-    """The ticked alerts and groups, and why they are acknowledged."""
+    """The ticked alarms and groups, and why they are acknowledged."""
 
     ids: Annotated[list[ItemId], Field(default_factory=list, max_length=500)]
     groups: Annotated[
@@ -136,23 +136,23 @@ class AcknowledgementForm(Model):
         return f"{self.why}: {self.words}" if self.words else self.why
 
 
-@router.get("/attention", dependencies=[READ, OVERVIEW_SLOT])
-def get_attention_page(
+@router.get("/alarms", dependencies=[READ, OVERVIEW_SLOT])
+def get_alarms_page(
     request: Request,
-    query: Annotated[AttentionQuery, Query()],
+    query: Annotated[AlarmQuery, Query()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
 ) -> HTMLResponse:
-    """Alerts that are not acknowledged, or those that are, by severity and reason or in a list."""
+    """Alarms that are not acknowledged, or those that are, by severity and reason or in a list."""
     with runtime.database.reading() as session:
-        items, pending = list_alerts(session, cache, runtime.settings)
+        items, pending = find_alarms(session, cache, runtime.settings)
         done = query.done and acknowledgements.list_batches(session, 1, number=query.done)
         chosen = query.choose(items)
         causes = find_common_causes(session, chosen, runtime.settings)
-    groups = group_alerts(chosen)
+    groups = group_alarms(chosen)
     return render(
         request,
-        "attention.html",
+        "alarms.html",
         query=query,
         reasons=REASONS,
         severities=SEVERITIES,
@@ -160,7 +160,7 @@ def get_attention_page(
         groups=groups if query.sort == "severity" else [],
         chosen=chosen,
         causes=causes,
-        single=len(chosen) - sum(len(cause.alerts) for cause in causes),
+        single=len(chosen) - sum(len(cause.alarms) for cause in causes),
         listed=_LISTED if query.reason is None else 5 * _LISTED,
         others=sum((item.acknowledged_by is not None) != query.acknowledged for item in items),
         done=done[0] if done else None,
@@ -169,29 +169,29 @@ def get_attention_page(
     )
 
 
-@router.get("/attention/count", dependencies=[READ])
-def get_attention_count(count: AttentionCountDep) -> Response:
-    """The number of alerts that are not acknowledged, for the menu."""
+@router.get("/alarms/count", dependencies=[READ])
+def get_alarm_count(count: AlarmCountDep) -> Response:
+    """The number of alarms that are not acknowledged, for the menu."""
     return HTMLResponse(count_badge(count.read()))
 
 
-@router.post("/attention/acknowledgements", dependencies=[OPERATE])
+@router.post("/alarms/acknowledgements", dependencies=[OPERATE])
 def post_acknowledgement_form(
-    query: Annotated[AttentionQuery, Query()],
+    query: Annotated[AlarmQuery, Query()],
     form: Annotated[AcknowledgementForm, Form()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> Response:
-    """Acknowledge the ticked alerts and groups with one reason, and return to the list."""
+    """Acknowledge the ticked alarms and groups with one reason, and return to the list."""
     ids = dict.fromkeys(form.ids)
     with runtime.database.reading() as session:
-        found = list_alerts(session, cache, runtime.settings)
-        chosen = query.choose(found.alerts)
+        found = find_alarms(session, cache, runtime.settings)
+        chosen = query.choose(found.alarms)
         causes = find_common_causes(session, chosen, runtime.settings)
-    groups = {group.token: group.alerts for group in group_alerts(chosen)}
-    groups |= {cause.token: cause.alerts for cause in causes}
+    groups = {group.token: group.alarms for group in group_alarms(chosen)}
+    groups |= {cause.token: cause.alarms for cause in causes}
     for token in form.groups:
         if token not in groups:
             name = "cause" if token.startswith("cause:") else "reason"
@@ -199,20 +199,20 @@ def post_acknowledgement_form(
                 f"groups: the alarms of this {name} changed since the page was opened; look at"
                 " them again"
             )
-        ids |= dict.fromkeys(alert.id for alert in groups[token])
+        ids |= dict.fromkeys(alarm.id for alarm in groups[token])
     done = acknowledge(runtime, found, list(ids), identity.name, form.comment)
     count.forget()
     count.read()
     return go_to(query.link(done=done[0].acknowledgement))
 
 
-@router.post("/attention/acknowledgements/{number}/undo", dependencies=[OPERATE])
+@router.post("/alarms/acknowledgements/{number}/undo", dependencies=[OPERATE])
 def post_undo_form(
     number: Annotated[Version, Path(description="Number of the acknowledgement.")],
     runtime: RuntimeDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
-    page: Annotated[Literal["attention", "history"], Query()] = "attention",
+    page: Annotated[Literal["alarms", "history"], Query()] = "alarms",
     heliostat: Annotated[Name | None, Query()] = None,
 ) -> Response:
     """Undo an acknowledgement, and return to the page."""
@@ -221,24 +221,24 @@ def post_undo_form(
     count.read()
     if heliostat is not None:
         return go_to(f"/heliostats/{heliostat}#warnings-title")
-    return go_to("/attention" if page == "attention" else "/attention/history")
+    return go_to("/alarms" if page == "alarms" else "/alarms/history")
 
 
-@router.get("/attention/history", dependencies=[READ, OVERVIEW_SLOT])
-def get_attention_history_page(
+@router.get("/alarms/history", dependencies=[READ, OVERVIEW_SLOT])
+def get_alarm_history_page(
     request: Request,
     query: Annotated[HistoryQuery, Query()],
     runtime: RuntimeDep,
     cache: FieldCacheDep,
 ) -> HTMLResponse:
-    """Acknowledgements with their reasons, and alerts that are or were present."""
-    wanted = AlertFilter(query.reason, heliostat=query.heliostat)
+    """Acknowledgements with their reasons, and alarms that are or were present."""
+    wanted = AlarmFilter(query.reason, heliostat=query.heliostat)
     rows = read_history(runtime, cache, _LISTED + 1, query.after, wanted)
     with runtime.database.reading() as session:
         batches = acknowledgements.list_batches(session, _BATCHES)
     return render(
         request,
-        "attention_history.html",
+        "alarm_history.html",
         reasons=REASONS,
         severities=SEVERITIES,
         query=query,

@@ -1,6 +1,6 @@
-"""Probable common causes of alerts that began together.
+"""Probable common causes of alarms that began together.
 
-Alerts of one reason that began within a day, and more often than usual, are a burst. What the store
+Alarms of one reason that began within a day, and more often than usual, are a burst. What the store
 knows of that time is evidence of its cause. Bursts with the same evidence have one cause.
 """
 
@@ -25,16 +25,16 @@ from service.store.tables import (
     ModelRow,
     TargetRow,
 )
-from service.twin.alerts.acknowledging import AlertsTogether
-from service.twin.alerts.alerts import Alert
-from service.twin.alerts.reasons import REASONS, Reason
+from service.twin.alarms.acknowledging import AlarmsTogether
+from service.twin.alarms.alarms import Alarm
+from service.twin.alarms.reasons import REASONS, Reason
 
-MIN_ALERTS = 5
-"""Smallest number of alerts in a burst."""
+MIN_ALARMS = 5
+"""Smallest number of alarms in a burst."""
 
 _WINDOW = timedelta(days=1)
-_LEAST_RATIO = 5.0  # of a burst's alerts to those that begin on another day
-_LEAST_DAYS = 30.0  # over which the other alerts are counted at least
+_LEAST_RATIO = 5.0  # of a burst's alarms to those that begin on another day
+_LEAST_DAYS = 30.0  # over which the other alarms are counted at least
 _WINDY_M_S = 10.0
 _NEARLY_ALL = 0.8
 _MOST_NAMES = 1000  # heliostats whose photographs are read
@@ -59,32 +59,32 @@ _WHEN_TAKEN: tuple[Reason, ...] = ("accuracy", "fell", "moved", "pointing")
 
 
 @dataclass(frozen=True)
-class CommonCause(AlertsTogether):
-    """Alerts that probably have one cause. ``evidence`` is empty if the store has none."""
+class CommonCause(AlarmsTogether):
+    """Alarms that probably have one cause. ``evidence`` is empty if the store has none."""
 
     evidence: tuple[str, ...]
 
     @property
     def heliostats(self) -> list[str]:
         """Names of the heliostats."""
-        return sorted({alert.heliostat for alert in self.alerts if alert.heliostat})
+        return sorted({alarm.heliostat for alarm in self.alarms if alarm.heliostat})
 
     @property
     def reasons(self) -> dict[Reason, int]:
-        """Number of alerts of each reason."""
-        return dict(Counter(alert.reason for alert in self.alerts))
+        """Number of alarms of each reason."""
+        return dict(Counter(alarm.reason for alarm in self.alarms))
 
     @property
     def token(self) -> str:
-        """Identifier of the cause with exactly these alerts."""
+        """Identifier of the cause with exactly these alarms."""
         return self.token_for("cause")
 
 
 def find_common_causes(
-    session: Session, alerts: Sequence[Alert], settings: Settings
+    session: Session, alarms: Sequence[Alarm], settings: Settings
 ) -> list[CommonCause]:
-    """Find bursts among ``alerts`` that nobody acknowledged, the largest first."""
-    opened = [alert for alert in alerts if alert.acknowledged_by is None]
+    """Find bursts among ``alarms`` that nobody acknowledged, the largest first."""
+    opened = [alarm for alarm in alarms if alarm.acknowledged_by is None]
     found = [
         CommonCause(burst, tuple(_evidence(session, burst, opened, settings)))
         for reason in REASONS
@@ -96,25 +96,25 @@ def find_common_causes(
     ):
         same = list(causes)
         merged += (
-            [CommonCause(tuple(alert for one in same for alert in one.alerts), evidence)]
+            [CommonCause(tuple(alarm for one in same for alarm in one.alarms), evidence)]
             if evidence
             else same
         )
-    return sorted(merged, key=lambda one: -len(one.alerts))
+    return sorted(merged, key=lambda one: -len(one.alarms))
 
 
-def find_bursts(alerts: Sequence[Alert]) -> list[tuple[Alert, ...]]:
-    """Find the alerts of one reason that began within a day, repeatedly the most at once."""
+def find_bursts(alarms: Sequence[Alarm]) -> list[tuple[Alarm, ...]]:
+    """Find the alarms of one reason that began within a day, repeatedly the most at once."""
     bursts = []
-    rest = sorted(alerts, key=lambda alert: alert.since)
-    while len(rest) >= MIN_ALERTS:
-        moments = [alert.since for alert in rest]
+    rest = sorted(alarms, key=lambda alarm: alarm.since)
+    while len(rest) >= MIN_ALARMS:
+        moments = [alarm.since for alarm in rest]
         ends = [bisect_right(moments, moment + _WINDOW) for moment in moments]
         start = max(range(len(rest)), key=lambda place: ends[place] - place)
         burst, others = rest[start : ends[start]], rest[:start] + rest[ends[start] :]
         span = rest[-1].since - rest[0].since
         usual = len(others) / max(span / _WINDOW, _LEAST_DAYS)
-        if len(burst) < max(MIN_ALERTS, _LEAST_RATIO * usual):
+        if len(burst) < max(MIN_ALARMS, _LEAST_RATIO * usual):
             break
         bursts.append(tuple(burst))
         rest = others
@@ -126,14 +126,14 @@ def find_bursts(alerts: Sequence[Alert]) -> list[tuple[Alert, ...]]:
 
 
 def _evidence(
-    session: Session, burst: tuple[Alert, ...], alerts: Sequence[Alert], settings: Settings
+    session: Session, burst: tuple[Alarm, ...], alarms: Sequence[Alarm], settings: Settings
 ) -> Iterator[str]:
     """What the store knows of the time when a burst began, the most specific first."""
     reason, cause = burst[0].reason, CommonCause(burst, ())
     before = cause.first_at - _WINDOW
-    for alert in alerts:
-        if reason in _CAUSED.get(alert.reason, ()) and before <= alert.since <= cause.last_at:
-            yield f"{REASONS[alert.reason].label.lower()}: {alert.message}"
+    for alarm in alarms:
+        if reason in _CAUSED.get(alarm.reason, ()) and before <= alarm.since <= cause.last_at:
+            yield f"{REASONS[alarm.reason].label.lower()}: {alarm.message}"
     if reason in _BY_MODEL:
         yield from _models(session, before, cause.last_at)
     if reason in _BY_JOB:
@@ -211,7 +211,7 @@ def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterat
 
 def _unphotographed(session: Session, cause: CommonCause, settings: Settings) -> Iterator[str]:
     """Whether nobody photographed the field, or the heliostats were added together."""
-    allowed = timedelta(days=settings.attention_photograph_days)
+    allowed = timedelta(days=settings.alarm_photograph_days)
     last = cause.last_at - allowed
     newest = session.scalar(
         select(func.max(MeasurementRow.taken_at)).where(MeasurementRow.accepted)

@@ -1,14 +1,14 @@
-"""Numbers of open alerts."""
+"""Numbers of open alarms."""
 
 import math
 import threading
 import time
 from collections import Counter
 
-from service.twin.alerts.acknowledging import record_history
-from service.twin.alerts.alerts import list_alerts
-from service.twin.alerts.field_overview import FieldOverviewCache
-from service.twin.alerts.reasons import SEVERITIES, Severity
+from service.twin.alarms.acknowledging import record_history
+from service.twin.alarms.alarms import find_alarms
+from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.reasons import SEVERITIES, Severity
 from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
 
@@ -18,10 +18,10 @@ _COUNT_HOLDS_S = 15.0
 _QUICK_S = 0.3
 
 
-class AlertCount:
-    """Numbers of open alerts, which nobody has acknowledged, for the menu of every page.
+class AlarmCount:
+    """Numbers of open alarms, which nobody has acknowledged, for the menu of every page.
 
-    They are cached for some seconds. Each count also records the history of alerts.
+    They are cached for some seconds. Each count also records the history of alarms.
     """
 
     def __init__(self, runtime: Runtime, cache: FieldOverviewCache) -> None:
@@ -31,7 +31,7 @@ class AlertCount:
         self._counted_s = -math.inf
         self._number = 0  # of counts so far
         self._background: BackgroundCache[int, dict[Severity, int] | None] = BackgroundCache(
-            lambda _: self.by_severity(), None, "alerts", 1
+            lambda _: self.by_severity(), None, "alarms", 1
         )
 
     def close(self) -> None:
@@ -54,14 +54,14 @@ class AlertCount:
         self._background.wait_for(self._number, seconds)
 
     def by_severity(self) -> dict[Severity, int]:
-        """The number of open alerts of each severity, at most some seconds old."""
+        """The number of open alarms of each severity, at most some seconds old."""
         with self._lock:
             if time.monotonic() - self._counted_s >= _COUNT_HOLDS_S:
                 with self._runtime.database.reading() as session:
-                    found = list_alerts(session, self._cache, self._runtime.settings)
+                    found = find_alarms(session, self._cache, self._runtime.settings)
                 record_history(self._runtime, found)
                 counted = Counter(
-                    item.severity for item in found.alerts if item.acknowledged_by is None
+                    item.severity for item in found.alarms if item.acknowledged_by is None
                 )
                 self._counted = {severity: counted[severity] for severity in SEVERITIES}
                 self._counted_s = time.monotonic()
@@ -69,15 +69,15 @@ class AlertCount:
             return dict(self._counted)
 
     def read(self) -> int:
-        """The number of all open alerts."""
+        """The number of all open alarms."""
         return sum(self.by_severity().values())
 
     @property
     def last(self) -> int:
-        """The number of all open alerts at the last count, without a new one."""
+        """The number of all open alarms at the last count, without a new one."""
         return sum(self._counted.values())
 
     def forget(self) -> None:
-        """Count again at the next read, because an alert was acknowledged."""
+        """Count again at the next read, because an alarm was acknowledged."""
         with self._lock:
             self._counted_s = -math.inf

@@ -1,4 +1,4 @@
-"""Alerts, and who has acknowledged them."""
+"""Alarms, and who has acknowledged them."""
 
 from datetime import datetime
 from operator import attrgetter
@@ -11,16 +11,16 @@ from service.base import fields
 from service.base.fields import Author, CreatedAt, From, Id, Model, Name, Version, from_row
 from service.store import acknowledgements
 from service.store.acknowledgements import AcknowledgementBatch, AlarmHistory
-from service.twin.alerts.acknowledging import (
-    AlertFilter,
+from service.twin.alarms.acknowledging import (
+    AlarmFilter,
     acknowledge,
     read_history,
     undo_acknowledgement,
 )
-from service.twin.alerts.alerts import Alert, list_alerts
-from service.twin.alerts.common_causes import find_common_causes
-from service.twin.alerts.counts import AlertCount
-from service.twin.alerts.reasons import REASONS, Reason, Severity
+from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.common_causes import find_common_causes
+from service.twin.alarms.counts import AlarmCount
+from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
@@ -34,7 +34,7 @@ from service.web.auth.dependencies import (
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
 
-router = APIRouter(prefix="/attention", tags=["attention"])
+router = APIRouter(prefix="/alarms", tags=["alarms"])
 
 ItemId = Annotated[
     str,
@@ -49,11 +49,11 @@ ItemId = Annotated[
 ]
 
 
-class AttentionOut(BaseModel):
-    """An alert: something that needs attention."""
+class AlarmOut(BaseModel):
+    """Something that an operator should look at."""
 
     id: ItemId
-    reason: Reason = Field(description="What kind of alert it is.")
+    reason: Reason = Field(description="What kind of alarm it is.")
     severity: Severity = Field(
         description="By the reason: 1 act now, 2 act today, 3 when there is time."
     )
@@ -72,13 +72,13 @@ class AttentionOut(BaseModel):
     )
 
 
-def attention_out(item: Alert) -> AttentionOut:
-    """An alert as JSON."""
-    return AttentionOut.model_validate(item, from_attributes=True)
+def alarm_out(item: Alarm) -> AlarmOut:
+    """An alarm as JSON."""
+    return AlarmOut.model_validate(item, from_attributes=True)
 
 
-class AttentionPage(Page[AttentionOut]):
-    """A part of the list of alerts."""
+class AlarmPage(Page[AlarmOut]):
+    """A part of the list of alarms."""
 
     pending: int = Field(
         description="Heliostats whose pointing error is still being computed; ask again for them."
@@ -86,31 +86,31 @@ class AttentionPage(Page[AttentionOut]):
 
 
 class AcknowledgementsIn(Model):
-    """Alerts to acknowledge."""
+    """Alarms to acknowledge."""
 
     ids: list[ItemId] = Field(
-        min_length=1, max_length=500, description="Ids of items of `GET /v1/attention`."
+        min_length=1, max_length=500, description="Ids of items of `GET /v1/alarms`."
     )
     reason: Annotated[fields.Reason, Field(description="Why they are acknowledged.")]
 
 
 class AcknowledgementOut(BaseModel):
-    """Alerts that were acknowledged together."""
+    """Alarms that were acknowledged together."""
 
     id: Id
     created_at: CreatedAt
     created_by: Author
     reason: str = Field(description="Why; empty if it was acknowledged before reasons were asked.")
-    alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
+    alarms: dict[Reason, int] = Field(description="Number of alarms by their reason.")
     undone_at: datetime | None = Field(description="When it was undone; null: it was not.")
     undone_by: str | None = Field(description="Name of the key that undid it.")
 
 
-class AlertHistoryOut(BaseModel):
-    """An alert from its beginning to its end."""
+class AlarmHistoryOut(BaseModel):
+    """An alarm from its beginning to its end."""
 
     id: Id
-    reason: Reason = Field(description="What kind of alert it is.")
+    reason: Reason = Field(description="What kind of alarm it is.")
     severity: Severity = Field(
         description="By the reason: 1 act now, 2 act today, 3 when there is time."
     )
@@ -130,28 +130,28 @@ _ID = attrgetter("id")
 
 
 class CommonCauseOut(BaseModel):
-    """Alerts that probably have one cause."""
+    """Alarms that probably have one cause."""
 
-    alerts: dict[Reason, int] = Field(description="Number of alerts by their reason.")
+    alarms: dict[Reason, int] = Field(description="Number of alarms by their reason.")
     first_at: From
     last_at: datetime = Field(description="When the newest of them began.")
     evidence: list[str] = Field(
         description="What the store knows of that time; empty if it knows nothing."
     )
     heliostats: list[str] = Field(description="Names of the heliostats.")
-    ids: list[ItemId] = Field(description="Ids of the alerts, to acknowledge them together.")
+    ids: list[ItemId] = Field(description="Ids of the alarms, to acknowledge them together.")
 
 
-async def _count(request: Request) -> AlertCount:
-    count: AlertCount = request.app.state.attention
+async def _count(request: Request) -> AlarmCount:
+    count: AlarmCount = request.app.state.alarms
     return count
 
 
-AttentionCountDep = Annotated[AlertCount, Depends(_count)]
+AlarmCountDep = Annotated[AlarmCount, Depends(_count)]
 
 
 @router.get("", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
-def list_attention(
+def list_alarms(
     runtime: RuntimeDep,
     cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
@@ -160,18 +160,18 @@ def list_attention(
     ] = None,
     heliostat: Annotated[Name | None, Query(description="Only this heliostat.")] = None,
     acknowledged: Annotated[
-        bool | None, Query(description="Only alerts that are, or are not, acknowledged.")
+        bool | None, Query(description="Only alarms that are, or are not, acknowledged.")
     ] = None,
     limit: Limit = 100,
     after: Annotated[ItemId | None, Query(description="The last id of the page before.")] = None,
-) -> AttentionPage:
-    """List alerts, in the order of ids. The thresholds are those of the current settings."""
+) -> AlarmPage:
+    """List alarms, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
-        items, pending = list_alerts(session, cache, runtime.settings)
-    chosen = AlertFilter(reason, severity, heliostat, acknowledged).choose(items)
+        items, pending = find_alarms(session, cache, runtime.settings)
+    chosen = AlarmFilter(reason, severity, heliostat, acknowledged).choose(items)
     wanted = sorted((item for item in chosen if after is None or item.id > after), key=_ID)
-    part = page([attention_out(item) for item in wanted[: limit + 1]], limit)
-    return AttentionPage(items=part.items, next=part.next, pending=pending)
+    part = page([alarm_out(item) for item in wanted[: limit + 1]], limit)
+    return AlarmPage(items=part.items, next=part.next, pending=pending)
 
 
 @router.post(
@@ -182,20 +182,20 @@ def list_attention(
 def post_acknowledgements(
     runtime: RuntimeDep,
     cache: FieldCacheDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
     seen: Annotated[AcknowledgementsIn, Body()],
-) -> Page[AttentionOut]:
-    """Acknowledge alerts together, with a reason.
+) -> Page[AlarmOut]:
+    """Acknowledge alarms together, with a reason.
 
-    An acknowledgement lasts until the reason of the alert changes or returns, or until it is
+    An acknowledgement lasts until the reason of the alarm changes or returns, or until it is
     undone. The first one is kept.
     """
     with runtime.database.reading() as session:
-        found = list_alerts(session, cache, runtime.settings)
+        found = find_alarms(session, cache, runtime.settings)
     items = acknowledge(runtime, found, seen.ids, identity.name, seen.reason)
     count.forget()
-    return Page(items=[attention_out(item) for item in items], next=None)
+    return Page(items=[alarm_out(item) for item in items], next=None)
 
 
 @router.get("/acknowledgements", responses=problems(), dependencies=[READ])
@@ -214,10 +214,10 @@ def list_acknowledgements(
 def undo_acknowledgements(
     number: Annotated[Version, Path(description="Number of the acknowledgement.")],
     runtime: RuntimeDep,
-    count: AttentionCountDep,
+    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> AcknowledgementOut:
-    """Undo an acknowledgement: its alerts are open again."""
+    """Undo an acknowledgement: its alarms are open again."""
     undo_acknowledgement(runtime, number, identity.name)
     count.forget()
     with runtime.database.reading() as session:
@@ -226,19 +226,19 @@ def undo_acknowledgements(
 
 
 @router.get("/causes", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
-def list_attention_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonCauseOut]:
-    """List probable causes of open alerts, the one of most first."""
+def list_alarm_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonCauseOut]:
+    """List probable causes of open alarms, the one of most first."""
     with runtime.database.reading() as session:
-        items, _ = list_alerts(session, cache, runtime.settings)
+        items, _ = find_alarms(session, cache, runtime.settings)
         causes = find_common_causes(session, items, runtime.settings)
     return Page(
         items=[
             from_row(
                 CommonCauseOut,
                 cause,
-                alerts=cause.reasons,
+                alarms=cause.reasons,
                 evidence=list(cause.evidence),
-                ids=[alert.id for alert in cause.alerts],
+                ids=[alarm.id for alarm in cause.alarms],
             )
             for cause in causes
         ],
@@ -247,24 +247,24 @@ def list_attention_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[Com
 
 
 @router.get("/history", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
-def list_attention_history(
+def list_alarm_history(
     runtime: RuntimeDep,
     cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
     heliostat: Annotated[Name | None, Query(description="Only this heliostat.")] = None,
     limit: Limit = 100,
     after: After = None,
-) -> Page[AlertHistoryOut]:
-    """List alerts that are or were present, the newest first."""
-    rows = read_history(runtime, cache, limit + 1, after, AlertFilter(reason, None, heliostat))
+) -> Page[AlarmHistoryOut]:
+    """List alarms that are or were present, the newest first."""
+    rows = read_history(runtime, cache, limit + 1, after, AlarmFilter(reason, None, heliostat))
     return page([_history(row) for row in rows], limit)
 
 
 def _acknowledgement(row: AcknowledgementBatch) -> AcknowledgementOut:
-    return from_row(AcknowledgementOut, row, reason=row.comment, alerts=row.reasons)
+    return from_row(AcknowledgementOut, row, reason=row.comment, alarms=row.reasons)
 
 
-def _history(entry: AlarmHistory) -> AlertHistoryOut:
+def _history(entry: AlarmHistory) -> AlarmHistoryOut:
     made = [
         from_row(
             AcknowledgementOut,
@@ -273,13 +273,13 @@ def _history(entry: AlarmHistory) -> AlertHistoryOut:
             created_at=row.made_at,
             created_by=row.made_by,
             reason=row.comment,
-            alerts={row.reason: 1},
+            alarms={row.reason: 1},
         )
         for row in entry.acknowledgements
     ]
     severity = REASONS[cast(Reason, entry.row.reason)].severity
     return from_row(
-        AlertHistoryOut,
+        AlarmHistoryOut,
         entry.row,
         heliostat=entry.heliostat,
         severity=severity,

@@ -1,4 +1,4 @@
-"""Needs attention: each reason, its acknowledgement and when that ends, on the page, over REST and
+"""Alarms: each reason, its acknowledgement and when that ends, on the page, over REST and
 as metrics.
 """
 
@@ -25,8 +25,8 @@ from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
-from service.twin.alerts.counts import AlertCount
-from service.twin.alerts.reasons import REASONS, Reason
+from service.twin.alarms.counts import AlarmCount
+from service.twin.alarms.reasons import REASONS, Reason
 from service.twin.surfaces.accuracy import accuracy_drop
 from service.web.app import create_app
 from tests.service.conftest import (
@@ -47,7 +47,7 @@ from tests.service.studies import SLOPE, study_row
 from tests.service.web.operations import Doubter
 
 HTML = {"Accept": "text/html"}
-PATH = "/v1/attention"
+PATH = "/v1/alarms"
 
 
 class Blind(FakeOperations):
@@ -88,11 +88,11 @@ def test_every_reason_has_its_words():
     assert set(REASONS) == set(get_args(Reason))
 
 
-def test_nothing_needs_attention_where_all_is_well(client: TestClient, post: Post):
+def test_no_alarm_where_all_is_well(client: TestClient, post: Post):
     post(png(1), **recent())
     assert items(client) == []
-    assert "Nothing." in client.get("/attention", headers=HTML).text
-    assert client.get("/attention/count", headers=HTML).text == ""
+    assert "Nothing." in client.get("/alarms", headers=HTML).text
+    assert client.get("/alarms/count", headers=HTML).text == ""
 
 
 def test_month_without_a_photograph(app: FastAPI, client: TestClient, post: Post):
@@ -194,7 +194,7 @@ def test_accuracy_that_fell_above_the_least(tmp_path: Path):
         (item,) = items(client)
         assert item["reason"] == "fell"
         assert "with an accuracy of 81% in the median when they came, 96% before" in item["message"]
-        assert "Accuracy fell" in client.get("/attention", headers=HTML).text
+        assert "Accuracy fell" in client.get("/alarms", headers=HTML).text
         # The heliostat's page ranks it first, with a prediction from photographs since then.
         page = client.get("/heliostats/AA39", headers=HTML).text
         (first, *_) = re.findall(r"<strong>(.*?)</strong>.*?: (.*)", page[page.index("causes") :])
@@ -252,7 +252,7 @@ def test_warnings_are_acknowledged_once_on_either_page(tmp_path: Path):
 @pytest.fixture
 def calibrating(tmp_path: Path) -> Iterator[TestClient]:
     """With a worker, and a bound that a mount calibrated by three photographs exceeds."""
-    options = QUIET | {"job_workers": 1, "job_poll_s": 0.05, "attention_pointing_mrad": 0.2}
+    options = QUIET | {"job_workers": 1, "job_poll_s": 0.05, "alarm_pointing_mrad": 0.2}
     settings = Settings(data_dir=tmp_path, **options)
     with client_of(create_app(settings, FakeOperations())) as client:
         client.put("/v1/plant", json=tower_document())
@@ -357,22 +357,22 @@ def test_queue_that_is_stuck(app: FastAPI, client: TestClient):
     (item,) = items(client)
     assert item["message"] == f"job {job.id} has waited since then"
     assert (
-        'heliotwin_attention{acknowledged="no",reason="queue",severity="1"} 1.0'
+        'heliotwin_alarms{acknowledged="no",reason="queue",severity="1"} 1.0'
         in client.get("/metrics").text
     )
     acknowledge(client, item)
     metrics = client.get("/metrics").text
-    assert 'heliotwin_attention{acknowledged="no",reason="queue",severity="1"} 0.0' in metrics
-    assert 'heliotwin_attention{acknowledged="yes",reason="queue",severity="1"} 1.0' in metrics
+    assert 'heliotwin_alarms{acknowledged="no",reason="queue",severity="1"} 0.0' in metrics
+    assert 'heliotwin_alarms{acknowledged="yes",reason="queue",severity="1"} 1.0' in metrics
 
 
 def test_severities_in_lists_tables_and_counts(stale: TestClient):
     assert {item["severity"] for item in items(stale, severity=3)} == {3}
     assert items(stale, severity=1) == []
     assert stale.get(PATH, params={"severity": 4}).status_code == 422
-    counts: AlertCount = stale.app.state.attention  # type: ignore[attr-defined]
+    counts: AlarmCount = stale.app.state.alarms  # type: ignore[attr-defined]
     assert counts.by_severity() == {1: 0, 2: 0, 3: 3}
-    assert stale.get("/attention.csv").text.splitlines()[1].split(",")[1] == "3"
+    assert stale.get("/alarms.csv").text.splitlines()[1].split(",")[1] == "3"
 
 
 @pytest.fixture
@@ -402,7 +402,7 @@ def test_list_in_parts_and_acknowledgement_of_all_or_none(stale: TestClient):
     gone = first["items"][0] | {"id": "AA39:no_photograph:00000000"}
     answer = acknowledge(stale, first["items"][1], gone)
     assert answer.status_code == 404
-    assert "does not need attention" in answer.text
+    assert "is not an alarm" in answer.text
     assert items(stale, acknowledged=True) == []
     assert acknowledge(stale, *first["items"]).status_code == 200
     before = items(stale, acknowledged=True)
@@ -410,25 +410,25 @@ def test_list_in_parts_and_acknowledgement_of_all_or_none(stale: TestClient):
     assert len(before) == 2
 
 
-def test_page_and_menu_show_alerts_and_forms_acknowledge_them(stale: TestClient):
-    page = stale.get("/attention", headers=HTML).text
+def test_page_and_menu_show_alarms_and_forms_acknowledge_them(stale: TestClient):
+    page = stale.get("/alarms", headers=HTML).text
     assert "None was ever accepted." in page
-    assert "HELIOTWIN_ATTENTION_" in page
-    assert stale.get("/attention/count").text.startswith('<span class="count">3<')
-    assert 'hx-get="/attention/count"' in page
+    assert "HELIOTWIN_ALARM_" in page
+    assert stale.get("/alarms/count").text.startswith('<span class="count">3<')
+    assert 'hx-get="/alarms/count"' in page
     one, two, three = (item["id"] for item in items(stale))
-    path = "/attention/acknowledgements?reason=no_photograph"
+    path = "/alarms/acknowledgements?reason=no_photograph"
     form: dict[str, Any] = {"ids": [one], "why": "Maintenance", "words": "row A"}
     answer = stale.post(path, data=form, headers=HTML, follow_redirects=False)
     assert answer.status_code == 303
-    assert re.fullmatch(r"/attention\?reason=no_photograph&done=\d+", answer.headers["Location"])
+    assert re.fullmatch(r"/alarms\?reason=no_photograph&done=\d+", answer.headers["Location"])
     page = stale.get(answer.headers["Location"], headers=HTML).text
     assert "1 acknowledged by local: Maintenance: row A" in page
-    assert stale.get("/attention/count").text.startswith('<span class="count">2<')
+    assert stale.get("/alarms/count").text.startswith('<span class="count">2<')
     form = {"ids": [two, three], "why": "Other", "words": "cloudy month"}
-    stale.post("/attention/acknowledgements", data=form, headers=HTML)
-    assert "Nothing." in stale.get("/attention", headers=HTML).text
-    assert "local, " in stale.get("/attention?acknowledged=true", headers=HTML).text
+    stale.post("/alarms/acknowledgements", data=form, headers=HTML)
+    assert "Nothing." in stale.get("/alarms", headers=HTML).text
+    assert "local, " in stale.get("/alarms?acknowledged=true", headers=HTML).text
 
 
 @pytest.mark.parametrize(
@@ -443,20 +443,20 @@ def test_page_and_menu_show_alerts_and_forms_acknowledge_them(stale: TestClient)
 def test_acknowledging_needs_alarms_and_a_reason(
     refusing: TestClient, form: dict[str, str], message: str
 ):
-    answer = refusing.post("/attention/acknowledgements", data=form, headers=HTML)
+    answer = refusing.post("/alarms/acknowledgements", data=form, headers=HTML)
     assert answer.status_code in (409, 422)
     assert message in answer.text
 
 
 def test_group_is_acknowledged_with_a_reason_and_undone(stale: TestClient):
-    page = stale.get("/attention", headers=HTML).text
+    page = stale.get("/alarms", headers=HTML).text
     (token,) = re.findall(r'name="groups" value="(\S+)"', page)
     form = {"groups": token, "why": "Follows from another alarm"}
-    stale.post("/attention/acknowledgements", data=form, headers=HTML)
+    stale.post("/alarms/acknowledgements", data=form, headers=HTML)
     seen = items(stale)
     assert {item["acknowledged_reason"] for item in seen} == {"Follows from another alarm"}
     (batch,) = stale.get(f"{PATH}/acknowledgements").json()["items"]
-    assert (batch["created_by"], batch["alerts"]) == ("local", {"no_photograph": 3})
+    assert (batch["created_by"], batch["alarms"]) == ("local", {"no_photograph": 3})
     assert {item["acknowledgement"] for item in seen} == {batch["id"]}
     undo = f"{PATH}/acknowledgements/{batch['id']}/undo"
     assert stale.post(undo).json()["undone_by"] == "local"
@@ -467,7 +467,7 @@ def test_group_is_acknowledged_with_a_reason_and_undone(stale: TestClient):
     acknowledge(stale, *items(stale))
     assert items(stale, acknowledged=False) == []
     newest = stale.get(f"{PATH}/acknowledgements", params={"limit": 1}).json()["items"][0]
-    answer = stale.post(f"/attention/acknowledgements/{newest['id']}/undo?page=history")
+    answer = stale.post(f"/alarms/acknowledgements/{newest['id']}/undo?page=history")
     assert "Follows from another alarm" in answer.text
     assert len(items(stale, acknowledged=False, heliostat="a-1")) == 1
 
@@ -488,14 +488,14 @@ def test_history_of_alarms(app: FastAPI, client: TestClient, post: Post):
     assert [(one["created_by"], one["reason"]) for one in entry["acknowledgements"]] == [
         ("local", "seen")
     ]
-    page = client.get("/attention/history", headers=HTML).text
-    assert 'href="/attention/history"' in client.get("/attention", headers=HTML).text
+    page = client.get("/alarms/history", headers=HTML).text
+    assert 'href="/alarms/history"' in client.get("/alarms", headers=HTML).text
     assert "None was ever accepted" in page
     # The menu's count records, too.
     with app.state.runtime.database.writing() as session:
         session.execute(update(MeasurementRow).values(taken_at=now() - timedelta(days=50)))
-    app.state.attention.forget()
-    assert client.get("/attention/count").text.startswith('<span class="count">1<')
+    app.state.alarms.forget()
+    assert client.get("/alarms/count").text.startswith('<span class="count">1<')
     present = client.get(f"{PATH}/history", params={"limit": 1}).json()
     assert present["items"][0]["closed_at"] is None
     assert present["next"] is not None
@@ -515,15 +515,15 @@ def test_undo_of_acknowledged_warnings_of_a_surface(tmp_path: Path):
 
 def test_filters_and_orders_of_the_page(stale: TestClient):
     def shown(**query: Any) -> list[str]:
-        page = stale.get("/attention", params=query, headers=HTML).text
+        page = stale.get("/alarms", params=query, headers=HTML).text
         return re.findall(r'<th scope="row"><a href="/heliostats/([^"]+)"', page)
 
     assert shown() == shown(severity=3, reason="no_photograph") == ["AA39", "AB01", "a-1"]
     assert shown(severity=1) == shown(heliostat="ZZ99") == shown(acknowledged=True) == []
     assert shown(sort="heliostat", heliostat="") == ["AA39", "AB01", "a-1"]
     assert shown(heliostat="AB01", sort="newest") == ["AB01"]
-    page = stale.get("/attention?sort=newest&severity=3", headers=HTML).text
-    assert 'href="/attention?severity=3&amp;sort=oldest">Since' in page
+    page = stale.get("/alarms?sort=newest&severity=3", headers=HTML).text
+    assert 'href="/alarms?severity=3&amp;sort=oldest">Since' in page
     assert 'aria-sort="descending"' in page
 
 
@@ -536,13 +536,11 @@ def test_who_acknowledged_is_the_key_and_audited(app: FastAPI, client: TestClien
     client.headers["Authorization"] = f"Bearer {reader}"
     (item,) = items(client)
     assert acknowledge(client, item).status_code == 403
-    assert '<h2 id="acknowledging-title' not in client.get("/attention", headers=HTML).text
+    assert '<h2 id="acknowledging-title' not in client.get("/alarms", headers=HTML).text
     client.headers["Authorization"] = f"Bearer {operator}"
     assert acknowledge(client, item).json()["items"][0]["acknowledged_by"] == "shift-2"
     with database.reading() as session:
-        (entry,) = session.scalars(
-            select(AuditRow).where(AuditRow.action == "attention.acknowledged")
-        )
+        (entry,) = session.scalars(select(AuditRow).where(AuditRow.action == "alarm.acknowledged"))
     assert (entry.actor, entry.subject, entry.detail["reason"]) == (
         "shift-2",
         "heliostat AA39",

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow, MeasurementRow
-from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.alarms.field_overview import HeliostatOverview
 
 Period = Literal["7", "30", "90", "all"]
 

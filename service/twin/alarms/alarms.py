@@ -1,7 +1,7 @@
-"""Alerts: what needs an operator's attention, since when, and what to do.
+"""Alarms: what an operator should look at, since when, and what to do.
 
-All alerts are computed from the store and the field overview when they are read. Only
-acknowledgements are stored. Each alert has a ``fingerprint``, and an acknowledgement is valid as
+All alarms are computed from the store and the field overview when they are read. Only
+acknowledgements are stored. Each alarm has a ``fingerprint``, and an acknowledgement is valid as
 long as the fingerprint is the same. The fingerprint changes when the reason disappears and returns,
 or when its measured value doubles.
 """
@@ -39,14 +39,14 @@ from service.store.tables import (
     PlantRow,
     StudyRow,
 )
-from service.twin.alerts.field_overview import (
+from service.twin.alarms.field_overview import (
     PATIENCE_S,
     ActiveSurface,
     FieldOverviewCache,
     HeliostatOverview,
 )
-from service.twin.alerts.light import LostLight, find_lost_light
-from service.twin.alerts.reasons import REASONS, Reason, Severity
+from service.twin.alarms.light import LostLight, find_lost_light
+from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
@@ -54,8 +54,8 @@ from service.twin.studies.camera_watch import FIGURES, CameraChange
 
 
 @dataclass(frozen=True)
-class Alert:
-    """An alert of a heliostat, or of the plant if ``heliostat`` is None.
+class Alarm:
+    """An alarm of a heliostat, or of the plant if ``heliostat`` is None.
 
     ``measurements`` are identifiers of the heliostat's measurements to look at. ``acknowledgement``
     is the number of the batch in which it was acknowledged, for ``acknowledged_reason``.
@@ -75,11 +75,11 @@ class Alert:
 
     @property
     def key(self) -> acknowledgements.Key:
-        """What identifies the alert in the store."""
+        """What identifies the alarm in the store."""
         return acknowledgements.Key(self.heliostat, self.reason, self.fingerprint)
 
-    def with_acknowledgement(self, row: AcknowledgementRow) -> "Alert":
-        """Add who acknowledged the alert, when and why."""
+    def with_acknowledgement(self, row: AcknowledgementRow) -> "Alarm":
+        """Add who acknowledged the alarm, when and why."""
         return replace(
             self,
             acknowledged_by=row.made_by,
@@ -100,33 +100,33 @@ class Alert:
         return REASONS[self.reason].severity
 
 
-class AlertList(NamedTuple):
-    """Alerts, and the number of heliostats with pending results."""
+class AlarmList(NamedTuple):
+    """Alarms, and the number of heliostats with pending results."""
 
-    alerts: list[Alert]
+    alarms: list[Alarm]
     pending: int
 
 
-def list_alerts(session: Session, cache: FieldOverviewCache, settings: Settings) -> AlertList:
-    """List all alerts, sorted by urgency of the reason, then by time with the newest first."""
+def find_alarms(session: Session, cache: FieldOverviewCache, settings: Settings) -> AlarmList:
+    """List all alarms, sorted by urgency of the reason, then by time with the newest first."""
 
-    def read_alerts() -> AlertList:
+    def read_alarms() -> AlarmList:
         field, cameras = cache.read(session, PATIENCE_S), cache.cameras.read(session, settings)
-        lost = find_lost_light(cameras.light, settings.attention_light_loss)
-        alerts = alerts_of_heliostats(session, field.lines, settings, cameras.changes, lost)
-        return AlertList(alerts, field.pending)
+        lost = find_lost_light(cameras.light, settings.alarm_light_loss)
+        alarms = alarms_of_heliostats(session, field.lines, settings, cameras.changes, lost)
+        return AlarmList(alarms, field.pending)
 
-    return cache.recent(session, "attention", read_alerts)
+    return cache.recent(session, "alarms", read_alarms)
 
 
-def alerts_of_heliostats(
+def alarms_of_heliostats(
     session: Session,
     lines: Sequence[HeliostatOverview],
     settings: Settings,
     cameras: Sequence[CameraChange],
     lost_light: Sequence[LostLight] = (),
-) -> list[Alert]:
-    """List the alerts of the plant, its cameras and its heliostats.
+) -> list[Alarm]:
+    """List the alarms of the plant, its cameras and its heliostats.
 
     ``lines`` include the pointing errors.
     """
@@ -139,7 +139,7 @@ def alerts_of_heliostats(
         *_clock(session),
     ]
     found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
-    found += _without_photograph(session, timedelta(days=settings.attention_photograph_days), at)
+    found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
     found += [*_warned(session), *_dimmed(session, lost_light, settings)]
     for line in lines:
         found += _of_heliostat(line, settings, at)
@@ -158,7 +158,7 @@ def alerts_of_heliostats(
 # --------------------------------------------------------------------------------------------------
 
 
-def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alert]:
+def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alarm]:
     surface = line.surface or line.candidate
     if surface is not None and surface.warnings:
         yield _untrusted_surfaces(line.name, surface, at)
@@ -166,11 +166,11 @@ def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> 
         yield from _pointing(line, line.pointing, settings, at)
 
 
-def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Alert:
+def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Alarm:
     since = surface.warned_since or surface.created_at or at
     photographs = tuple(surface.suspicious or ())
     which = f"photograph{'s' if len(photographs) > 1 else ''} {', '.join(photographs)}"
-    return Alert(
+    return Alarm(
         "untrusted",
         name,
         since,
@@ -186,28 +186,26 @@ def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Aler
 
 def _pointing(
     line: HeliostatOverview, pointing: PointingState, settings: Settings, at: datetime
-) -> Iterator[Alert]:
+) -> Iterator[Alarm]:
     moved, is_new = pointing.moved, False
     if moved is not None:
         is_new = not moved.is_calibrated
-        is_late = at - moved.until < timedelta(days=settings.attention_moved_days)
+        is_late = at - moved.until < timedelta(days=settings.alarm_moved_days)
         if is_new or is_late:
             yield _moved_drives(line.name, moved)
     if pointing.beyond_since is not None and pointing.error_mrad is not None and not is_new:
         metres = "" if line.pointing_m is None else f", {line.pointing_m:.2f} m on the receiver"
-        yield Alert(
+        yield Alarm(
             "pointing",
             line.name,
             pointing.beyond_since,
             f"its spot is {pointing.error_mrad:.1f} mrad off{metres}",
             "photograph it where the calibration plan says, and calibrate its mount again",
-            _fingerprint(
-                pointing.beyond_since, pointing.error_mrad / settings.attention_pointing_mrad
-            ),
+            _fingerprint(pointing.beyond_since, pointing.error_mrad / settings.alarm_pointing_mrad),
         )
     if pointing.drifted is not None:
         drifted = pointing.drifted
-        yield Alert(
+        yield Alarm(
             "drift",
             line.name,
             drifted.since,
@@ -218,7 +216,7 @@ def _pointing(
         )
 
 
-def _moved_drives(name: str, moved: DriveStep) -> Alert:
+def _moved_drives(name: str, moved: DriveStep) -> Alarm:
     if moved.is_calibrated:
         size = f"its drives stepped by {moved.size_mrad:.1f} mrad"
         action = "find out why; its mount is calibrated since"
@@ -226,10 +224,10 @@ def _moved_drives(name: str, moved: DriveStep) -> Alert:
         size = f"its spot is {moved.size_mrad:.1f} mrad off since"
         action = "look at its drives and encoders, and calibrate its mount again"
     fingerprint = f"{moved.since.isoformat()} {moved.until.isoformat()}"
-    return Alert("moved", name, moved.until, f"it moved {moved.when}: {size}", action, fingerprint)
+    return Alarm("moved", name, moved.until, f"it moved {moved.when}: {size}", action, fingerprint)
 
 
-def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> Iterator[Alert]:
+def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> Iterator[Alarm]:
     """Find heliostats without a recent photograph, or whose photographs all have unknown times."""
     row, photograph = HeliostatRow, MeasurementRow
     newest, is_undated = func.max(photograph.taken_at), photograph.taken_at.is_(None)
@@ -257,7 +255,7 @@ def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> I
         if count:
             message = f"{message}; the time of {count} more is unknown"
             action = f"{action}, or {_GIVE_TIMES}"
-        yield Alert("no_photograph", name, begun + allowed, message, action, begun.isoformat())
+        yield Alarm("no_photograph", name, begun + allowed, message, action, begun.isoformat())
 
 
 _GIVE_TIMES = (
@@ -266,11 +264,11 @@ _GIVE_TIMES = (
 )
 
 
-def _times_unknown(name: str, count: int, first: datetime) -> Alert:
+def _times_unknown(name: str, count: int, first: datetime) -> Alarm:
     which = "its one accepted photograph" if count == 1 else f"all {count} accepted photographs"
     message = f"the time of {which} is unknown, and so is the age"
     action = f"{_GIVE_TIMES}, and have taken_at sent with each photograph"
-    return Alert("times_unknown", name, first, message, action, first.isoformat())
+    return Alarm("times_unknown", name, first, message, action, first.isoformat())
 
 
 _WARNED: dict[Reason, tuple[str, str, str]] = {
@@ -288,7 +286,7 @@ _WARNED: dict[Reason, tuple[str, str, str]] = {
 """Reasons that count measurements with a warning: warning type, message and remedy."""
 
 
-def _warned(session: Session) -> Iterator[Alert]:
+def _warned(session: Session) -> Iterator[Alarm]:
     """Find heliostats that have measurements with a warning; excluded measurements do not count."""
     row, photograph = HeliostatRow, MeasurementRow
     count, came = func.count(func.distinct(_photograph())), func.min(photograph.created_at)
@@ -301,7 +299,7 @@ def _warned(session: Session) -> Iterator[Alert]:
         for name, warned, first in session.execute(query.where(has_warning(type_))):
             message = f"{warned} measurement{'s' if warned > 1 else ''} {said}"
             action = f"see /photographs?heliostat={name}&warned=true, and {remedy}"
-            yield Alert(reason, name, first, message, action, _fingerprint(first, warned))
+            yield Alarm(reason, name, first, message, action, _fingerprint(first, warned))
 
 
 def _photograph() -> ColumnElement[str]:
@@ -314,8 +312,8 @@ def _fingerprint(since: datetime, times: float) -> str:
     return f"{since.isoformat()} {math.floor(math.log2(max(times, 1.0)))}"
 
 
-def _accuracies(session: Session, settings: Settings) -> Iterator[Alert]:
-    least = settings.attention_accuracy
+def _accuracies(session: Session, settings: Settings) -> Iterator[Alarm]:
+    least = settings.alarm_accuracy
     query = select(HeliostatRow.name, DriftRow.accuracy, DriftRow.poor_since, DriftRow.taken_at)
     poor = query.join(DriftRow, DriftRow.heliostat_id == HeliostatRow.id).where(
         DriftRow.accuracy < least
@@ -327,7 +325,7 @@ def _accuracies(session: Session, settings: Settings) -> Iterator[Alert]:
             f" {least:.0%} is the least"
         )
         action = "predict its surface again; if that does not help, study the photographs"
-        yield Alert(
+        yield Alarm(
             "accuracy",
             name,
             since,
@@ -337,12 +335,12 @@ def _accuracies(session: Session, settings: Settings) -> Iterator[Alert]:
         )
 
 
-def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alert]:
+def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alarm]:
     """Find heliostats whose newest photographs were forecast worse than earlier ones.
 
     The accuracies are those on arrival of each photograph.
     """
-    allowed = settings.attention_accuracy_drop
+    allowed = settings.alarm_accuracy_drop
     query = select(HeliostatRow.name, DriftRow).join(
         DriftRow, DriftRow.heliostat_id == HeliostatRow.id
     )
@@ -354,28 +352,28 @@ def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alert]:
             f" {allowed:.0%} is allowed"
         )
         action = "look for what changed on its mirror, and predict its surface again"
-        yield Alert(
+        yield Alarm(
             "fell", name, since, message, action, _fingerprint(since, drop / max(allowed, 1e-6))
         )
 
 
 def _dimmed(
     session: Session, lost_light: Sequence[LostLight], settings: Settings
-) -> Iterator[Alert]:
+) -> Iterator[Alarm]:
     """Report heliostats that lost light."""
     numbers = [one.heliostat for one in lost_light]
     query = select(HeliostatRow.id, HeliostatRow.name).where(HeliostatRow.id.in_(numbers))
     names: dict[int, str] = {row.id: row.name for row in session.execute(query)}
     for lost in lost_light:
-        yield Alert(
+        yield Alarm(
             "dimmed",
             names[lost.heliostat],
             lost.since,
             f"its newest {lost.photographs} photographs on {lost.target} have {lost.share:.0%} less"
             f" light than before, compared with other heliostats on the same days; by"
-            f" {lost.min_share:.0%} at least, and {settings.attention_light_loss:.0%} is allowed",
+            f" {lost.min_share:.0%} at least, and {settings.alarm_light_loss:.0%} is allowed",
             "look whether its mirror is dirty, covered or broken, and whether others shade it",
-            _fingerprint(lost.since, lost.min_share / settings.attention_light_loss),
+            _fingerprint(lost.since, lost.min_share / settings.alarm_light_loss),
         )
 
 
@@ -383,7 +381,7 @@ def _dimmed(
 # --------------------------------------------------------------------------------------------------
 
 
-def _queue(session: Session, settings: Settings) -> Iterator[Alert]:
+def _queue(session: Session, settings: Settings) -> Iterator[Alarm]:
     oldest = session.execute(
         select(JobRow.id, JobRow.created_at)
         .where(JobRow.state == "queued")
@@ -391,19 +389,19 @@ def _queue(session: Session, settings: Settings) -> Iterator[Alert]:
         .limit(1)
     ).one_or_none()
     if oldest is None or queue.database_time(session) - oldest.created_at < timedelta(
-        seconds=settings.attention_queue_s
+        seconds=settings.alarm_queue_s
     ):
         return
     message = f"job {oldest.id} has waited since then"
     action = "see whether a worker is alive, and what its log says"
-    yield Alert("queue", None, oldest.created_at, message, action, str(oldest.id))
+    yield Alarm("queue", None, oldest.created_at, message, action, str(oldest.id))
 
 
-# Most heliostats that the alert of a plan names.
+# Most heliostats that the alarm of a plan names.
 _NAMED = 10
 
 
-def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alert]:
+def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alarm]:
     """Find plans of aims for the current day whose heliostats or model changed since."""
     for plan in outdated_plans(session, settings.time_zone):
         names = plan.heliostats
@@ -414,7 +412,7 @@ def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alert]:
             before, current = plan.models
             said.insert(0, f"model version {current} instead of {before}, for all heliostats")
         on = "" if plan.target is None else f" on {plan.target}"
-        yield Alert(
+        yield Alarm(
             "aims_outdated",
             None,
             plan.made_at,
@@ -424,7 +422,7 @@ def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alert]:
         )
 
 
-def _camera(session: Session) -> Iterator[Alert]:
+def _camera(session: Session) -> Iterator[Alarm]:
     """Find camera changes in the newest study, and newly declared cameras.
 
     The study does not count if it is adopted.
@@ -439,7 +437,7 @@ def _camera(session: Session) -> Iterator[Alert]:
             scope = effect.get("scope") or {}
             if scope.get("kind") == "since" and CATALOGUE[effect["name"]].stage == "image":
                 name, day = effect["name"], scope["since"]
-                yield Alert(
+                yield Alarm(
                     "camera",
                     None,
                     datetime.fromisoformat(f"{day}T00:00:00+00:00"),
@@ -449,7 +447,7 @@ def _camera(session: Session) -> Iterator[Alert]:
                 )
     declared = _declared_anew(session)
     if declared is not None:
-        yield Alert(
+        yield Alarm(
             "camera",
             None,
             declared.adopted_at,
@@ -461,7 +459,7 @@ def _camera(session: Session) -> Iterator[Alert]:
         )
 
 
-def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alert]:
+def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alarm]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
     for change in cameras:
@@ -469,7 +467,7 @@ def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str)
         if declared is None or since > declared.adopted_at:
             way = "up" if change.ratio > 1 else "down"
             times = f"{change.ratio:.2f} times what it was"
-            yield Alert(
+            yield Alarm(
                 "camera",
                 None,
                 since,
@@ -482,7 +480,7 @@ def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str)
             )
 
 
-def _clock(session: Session) -> Iterator[Alert]:
+def _clock(session: Session) -> Iterator[Alarm]:
     """Report a clock error that the newest calibration found."""
     newest = (
         select(MountRow.document["clock"])
@@ -491,7 +489,7 @@ def _clock(session: Session) -> Iterator[Alert]:
     )
     clock = session.scalar(newest)
     if clock is not None:
-        yield Alert(
+        yield Alarm(
             "clock",
             None,
             datetime.fromisoformat(f"{clock['since']}T00:00:00+00:00"),

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from service.base.fields import Search, drop_empty_fields
-from service.twin.alerts.field_overview import HeliostatOverview
+from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.pointing.errors import NEWEST
 from service.twin.surfaces.accuracy import RECENT
 
@@ -17,7 +17,7 @@ class Metric:
     """A metric of a heliostat.
 
     ``name`` ends with the unit of its value. A share is shown in percent. If ``is_better_high``,
-    low values need attention, else high values do.
+    low values are bad, else high values are.
     """
 
     name: str
@@ -180,7 +180,7 @@ _OTHERS: dict[str, Callable[[HeliostatOverview], float | None]] = {
 
 
 def default_order(column: str) -> Order:
-    """The order that begins with heliostats that need attention; names ascend."""
+    """The order that begins with the worst heliostats; names ascend."""
     rises = column in ("name", "trusted") or (column in METRICS and METRICS[column].is_better_high)
     return "up" if rises else "down"
 

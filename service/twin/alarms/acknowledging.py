@@ -1,4 +1,4 @@
-"""Acknowledging alerts together, undoing that, and recording their history."""
+"""Acknowledging alarms together, undoing that, and recording their history."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -13,63 +13,63 @@ from service.store import acknowledgements
 from service.store.acknowledgements import AlarmHistory
 from service.store.surfaces import decisions
 from service.store.tables import HeliostatRow, SurfaceRow
-from service.twin.alerts.alerts import Alert, AlertList, list_alerts
-from service.twin.alerts.field_overview import FieldOverviewCache
-from service.twin.alerts.reasons import REASONS, Reason, Severity
+from service.twin.alarms.alarms import Alarm, AlarmList, find_alarms
+from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.runtime.runtime import Runtime
 
 
 @dataclass(frozen=True)
-class AlertFilter:
-    """Which alerts are wanted; None admits all."""
+class AlarmFilter:
+    """Which alarms are wanted; None admits all."""
 
     reason: Reason | None = None
     severity: int | None = None
     heliostat: str | None = None
     acknowledged: bool | None = None
 
-    def choose(self, alerts: Iterable[Alert]) -> list[Alert]:
+    def choose(self, alarms: Iterable[Alarm]) -> list[Alarm]:
         """The wanted ones, in their order."""
         return [
-            alert
-            for alert in alerts
-            if self.reason in (None, alert.reason)
-            and self.severity in (None, alert.severity)
-            and self.heliostat in (None, alert.heliostat)
-            and self.acknowledged in (None, alert.acknowledged_by is not None)
+            alarm
+            for alarm in alarms
+            if self.reason in (None, alarm.reason)
+            and self.severity in (None, alarm.severity)
+            and self.heliostat in (None, alarm.heliostat)
+            and self.acknowledged in (None, alarm.acknowledged_by is not None)
         ]
 
 
 @dataclass(frozen=True)
-class AlertsTogether:
-    """Alerts that are acknowledged together."""
+class AlarmsTogether:
+    """Alarms that are acknowledged together."""
 
-    alerts: tuple[Alert, ...]
+    alarms: tuple[Alarm, ...]
 
     @property
     def count(self) -> int:
-        """The number of alerts."""
-        return len(self.alerts)
+        """The number of alarms."""
+        return len(self.alarms)
 
     @property
     def first_at(self) -> datetime:
-        """Since when the oldest alert lasts."""
-        return min(alert.since for alert in self.alerts)
+        """Since when the oldest alarm lasts."""
+        return min(alarm.since for alarm in self.alarms)
 
     @property
     def last_at(self) -> datetime:
-        """Since when the newest alert lasts."""
-        return max(alert.since for alert in self.alerts)
+        """Since when the newest alarm lasts."""
+        return max(alarm.since for alarm in self.alarms)
 
     def token_for(self, name: str) -> str:
-        """Identifier of exactly these alerts, which changes if one comes, goes or changes."""
-        ids = "\n".join(sorted(alert.id for alert in self.alerts))
+        """Identifier of exactly these alarms, which changes if one comes, goes or changes."""
+        ids = "\n".join(sorted(alarm.id for alarm in self.alarms))
         return f"{name}:{hashlib.sha256(ids.encode()).hexdigest()[:12]}"
 
 
 @dataclass(frozen=True)
-class AlertGroup(AlertsTogether):
-    """Alerts of one reason."""
+class AlarmGroup(AlarmsTogether):
+    """Alarms of one reason."""
 
     reason: Reason
 
@@ -80,34 +80,34 @@ class AlertGroup(AlertsTogether):
 
     @property
     def token(self) -> str:
-        """Identifier of the group with exactly these alerts."""
+        """Identifier of the group with exactly these alarms."""
         return self.token_for(self.reason)
 
 
-def group_alerts(alerts: Sequence[Alert]) -> list[AlertGroup]:
-    """Group alerts by reason, the most urgent reason first."""
+def group_alarms(alarms: Sequence[Alarm]) -> list[AlarmGroup]:
+    """Group alarms by reason, the most urgent reason first."""
     groups = [
-        AlertGroup(tuple(alert for alert in alerts if alert.reason == reason), reason)
+        AlarmGroup(tuple(alarm for alarm in alarms if alarm.reason == reason), reason)
         for reason in REASONS
     ]
-    return [group for group in groups if group.alerts]
+    return [group for group in groups if group.alarms]
 
 
 def acknowledge(
-    runtime: Runtime, found: AlertList, ids: Sequence[str], actor: str, comment: str
-) -> list[Alert]:
-    """Acknowledge some of the alerts ``found`` as one batch; return them in the order of ``ids``.
+    runtime: Runtime, found: AlarmList, ids: Sequence[str], actor: str, comment: str
+) -> list[Alarm]:
+    """Acknowledge some of the alarms ``found`` as one batch; return them in the order of ``ids``.
 
     Raises
     ------
     NotFoundError
-        If an id is not a current alert. Then none is acknowledged.
+        If an id is not a current alarm. Then none is acknowledged.
     """
-    items = {item.id: item for item in found.alerts}
+    items = {item.id: item for item in found.alarms}
     missing = [number for number in ids if number not in items]
     if missing:
         raise NotFoundError(
-            f"ids: {missing[0]} does not need attention, or its reason changed; see /v1/attention"
+            f"ids: {missing[0]} is not an alarm, or its reason changed; see /v1/alarms"
         )
     record_history(runtime, found)
     chosen = [items[number] for number in ids]
@@ -124,25 +124,25 @@ def acknowledge(
 def acknowledge_surface(
     runtime: Runtime, cache: FieldOverviewCache, name: str, version: int, actor: str, comment: str
 ) -> None:
-    """Acknowledge the alert that a heliostat's surface is not trusted.
+    """Acknowledge the alarm that a heliostat's surface is not trusted.
 
     Raises
     ------
     ConflictError
-        If there is no such alert, or it is about another version.
+        If there is no such alarm, or it is about another version.
     """
     with runtime.database.reading() as session:
         heliostat = store.get_heliostat(session, name)
         surface = store.get_surface(session, heliostat, version)
-        found = list_alerts(session, cache, runtime.settings)
+        found = find_alarms(session, cache, runtime.settings)
         is_shown = _flagged_surface(session, heliostat).id == surface.id
-    alerts = AlertFilter("untrusted", heliostat=name).choose(found.alerts)
-    if not (alerts and is_shown):
+    alarms = AlarmFilter("untrusted", heliostat=name).choose(found.alarms)
+    if not (alarms and is_shown):
         raise ConflictError(
             f"heliostat {name}: surface {version} has no warnings to acknowledge; only those of"
             " the active surface can be acknowledged"
         )
-    acknowledge(runtime, found, [alert.id for alert in alerts], actor, comment)
+    acknowledge(runtime, found, [alarm.id for alarm in alarms], actor, comment)
 
 
 def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:
@@ -156,14 +156,14 @@ def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:
 
 
 def _flagged_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow:
-    """The surface that the alert "untrusted" is about."""
+    """The surface that the alarm "untrusted" is about."""
     candidate = store.find_candidate(session, heliostat)
     return candidate or store.get_surface_at(session, heliostat)
 
 
-def record_history(runtime: Runtime, found: AlertList) -> None:
-    """Record which alerts came and went. Nothing is recorded while results are pending."""
-    present = {item.key: (item.message, item.since) for item in found.alerts}
+def record_history(runtime: Runtime, found: AlarmList) -> None:
+    """Record which alarms came and went. Nothing is recorded while results are pending."""
+    present = {item.key: (item.message, item.since) for item in found.alarms}
     with runtime.database.reading() as session:
         is_known = acknowledgements.open_alarms(session).keys() == present.keys()
     if not (is_known or found.pending):
@@ -176,14 +176,14 @@ def read_history(
     cache: FieldOverviewCache,
     limit: int,
     after: int | None = None,
-    wanted: AlertFilter = AlertFilter(),
+    wanted: AlarmFilter = AlarmFilter(),
 ) -> list[AlarmHistory]:
-    """Up to ``limit`` alerts that are or were present, older than record ``after``.
+    """Up to ``limit`` alarms that are or were present, older than record ``after``.
 
     What came or went since the last record is recorded first.
     """
     with runtime.database.reading() as session:
-        found = list_alerts(session, cache, runtime.settings)
+        found = find_alarms(session, cache, runtime.settings)
     record_history(runtime, found)
     with runtime.database.reading() as session:
         return acknowledgements.list_history(session, limit, after, wanted.reason, wanted.heliostat)

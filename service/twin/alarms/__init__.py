@@ -1,0 +1,1 @@
+"""Field overview, heliostat filters, and alarms for the operator."""

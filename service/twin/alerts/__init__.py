@@ -1,1 +1,0 @@
-"""Field overview, heliostat filters, and alerts for the operator."""
