@@ -4,10 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test serve lint lock docs bench train network clean
+.PHONY: help install demo test test-all serve lint lock docs bench train network clean
 
 help: ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -19,7 +19,10 @@ install: $(VENV)/installed ## the virtual environment with everything in it
 demo: install ## photographs in, mirror surfaces and flux forecasts out, under out/demo
 	$(BIN)/heliotwin demo $(ARGS)
 
-test: install ## every test
+test: install ## what a change needs: units, routes, pages, one task of each user, on SQLite (5 minutes)
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not full" $(ARGS)
+
+test-all: install ## every test: also PostgreSQL, faults, browsers, images, notebooks (25 minutes)
 	$(BIN)/pytest -n 3 --dist loadgroup $(ARGS)
 
 lock: install ## the image's packages with their hashes, in the versions of constraints.txt

@@ -44,6 +44,22 @@ OF_ONE_WORKER = (
 """Files and folders whose tests share what is expensive to make: an image, a browser, an
 environment, a surface. The longest come first, and they come before all others.
 """
+FULL = (
+    "tests/docker/test_client.py",
+    "tests/docker/test_composition.py",
+    "tests/docker/test_generated_client.py",
+    "tests/documents/test_commands.py",
+    "tests/faults/",
+    "tests/heliotwin/test_networks.py",
+    "tests/heliotwin/test_notebooks.py",
+    "tests/service/browser/",
+    "tests/service/web/test_openapi_fuzz.py",
+    "tests/test_additions.py",
+    "tests/test_silence.py",
+    "tests/test_wheel.py",
+    "tests/undeclared/",
+)
+"""Files and folders that only ``make test-all`` runs: their tests have the marker ``full``."""
 
 # Time limit of requests that set none: the default of 5 s would fail on a busy machine.
 _patient = httpx.Timeout(WAIT_LIMIT_S)
@@ -71,12 +87,18 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FileScheduli
     return FileScheduling(config, log)
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark as ``full`` what lies in such a place, or needs PostgreSQL."""
+    if item.nodeid.startswith(FULL) or item.get_closest_marker("postgres"):
+        item.add_marker("full")
+
+
 @pytest.hookimpl(trylast=True)  # after pytest has grouped those with the same parameters
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest, and with files that hold long tests: at the end no worker has one
     alone.
     """
-    long = {item.path for item in items if item.get_closest_marker("slow")}
+    long = {item.path for item in items if item.get_closest_marker("full")}
 
     def order(item: pytest.Item) -> tuple[int, bool]:
         places = (item.nodeid.startswith(place) for place in OF_ONE_WORKER)

@@ -16,8 +16,6 @@ from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 from tests.watched import NotWatchedError, environment, opened, watching
 
-pytestmark = [pytest.mark.slow]
-
 HELIOTWIN = [sys.executable, "-m", "service"]
 # onnxruntime's telemetry, where it is on, looks its host up about ten seconds after it was loaded.
 LONG_ENOUGH_S = 15.0

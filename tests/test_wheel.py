@@ -24,8 +24,6 @@ from tests.docker.engine import clone
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
-pytestmark = [pytest.mark.slow]
-
 
 def _bare() -> dict[str, str]:
     """This process's environment without what would lead to this checkout or its packages."""

@@ -123,7 +123,7 @@ def configure(folder: Path, service: str, alertmanager: int, webhook: int) -> No
     (folder / "alertmanager.yml").write_text(yaml.safe_dump(sending), encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
     prometheus, alertmanager = (
         binary("prometheus"),
@@ -189,7 +189,7 @@ def fill(service: httpx.Client) -> None:
         assert send(png(number), **one).status_code == 201
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_each_panel_of_the_dashboard_draws_something(tmp_path: Path):
     """Of a live service, as a real Prometheus has it."""
     program, port = binary("prometheus"), free_port()

@@ -27,7 +27,7 @@ from tests.waiting import until
 from . import engine
 from .engine import Client, Composition
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.timeout(3600)
 
 
 @pytest.fixture(scope="module")

@@ -490,7 +490,7 @@ def _ignored(folder: str, names: list[str]) -> list[str]:
     return [name for name in names if any(fnmatch(name, pattern) for pattern in patterns)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_installed_copy_brings_migrations_and_weights(
     dockerfile: list[tuple[str, str]], tmp_path: Path
 ):

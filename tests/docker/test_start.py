@@ -51,7 +51,7 @@ def healthy(service: dict[str, Any], changes: dict[str, str], process: ForkedPro
     until(ask, "healthy")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.postgres
 def test_composition_starts_from_empty(compose: dict[str, Any], tmp_path: Path):
     services = compose["services"]

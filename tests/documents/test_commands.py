@@ -20,8 +20,6 @@ from tests.service.conftest import QUIET, serving
 
 from .prose import DOCS, ROOT
 
-pytestmark = [pytest.mark.slow]
-
 PAGES = [
     ROOT / "README.md",
     *sorted((DOCS / "tutorials").glob("*.md")),

@@ -11,7 +11,6 @@ from .harness import new_store
 from .scenarios import SCENARIOS, NotTriedError
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_nothing_acknowledged_is_lost(name: str, engine: str, tmp_path: Path):

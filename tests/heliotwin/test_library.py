@@ -135,7 +135,7 @@ def test_a_comparison_is_the_commands(plant, single_plant, tmp_path):
         assert one.forecast.shape == one.photograph.flux.shape
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_study_is_the_commands_and_its_effects_act(made_plant, tmp_path):
     root = tmp_path / "plant"
     root.mkdir()

@@ -27,8 +27,6 @@ from training.config import TrainConfig
 from training.type_network import TypeRun
 from training.type_prior import measured_kind, type_prior, untilted
 
-pytestmark = pytest.mark.slow
-
 SMALL = TrainConfig(
     steps=2,
     batch=2,

@@ -9,8 +9,6 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
 
-pytestmark = [pytest.mark.slow]
-
 NOTEBOOKS = Path(__file__).parents[2] / "docs" / "notebooks"
 
 

@@ -41,14 +41,14 @@ def alarms_of(client: TestClient) -> list[dict[str, Any]]:
     return items
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("fault", [f for f in FAULTS if f.alarm], ids=lambda fault: fault.kind)
 def test_faults_of_heliostats_raise_their_alarms(client: TestClient, fault: Fault):
     found = {one["heliostat"] for one in alarms_of(client) if one["reason"] == fault.alarm}
     assert found == set(fault.heliostats)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("kind", "cause"), [("drives stepped", "It moved"), ("facet canted", "The mirror changed")]
 )
@@ -62,7 +62,7 @@ def test_the_card_of_a_heliostat_ranks_its_fault(client: TestClient, kind: str, 
     assert "study 1 of its photographs" in model
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_hazy_week_is_seen_in_all_accuracies_and_then_gone(client: TestClient):
     (haze,) = (fault for fault in FAULTS if fault.kind == "hazy")
     query = select(MeasurementRow.taken_at, MeasurementRow.forecast_accuracy).join(HeliostatRow)
@@ -78,7 +78,7 @@ def test_a_hazy_week_is_seen_in_all_accuracies_and_then_gone(client: TestClient)
     assert during < min(before, after) - 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("fault", [f for f in FAULTS if f.refusal], ids=lambda fault: fault.kind)
 def test_faults_of_photographs_refuse_them(client: TestClient, fault: Fault):
     for name in fault.heliostats:
@@ -86,7 +86,7 @@ def test_faults_of_photographs_refuse_them(client: TestClient, fault: Fault):
         assert fault.refusal in {one["reason"] for one in items}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_study_of_the_hazy_days_finds_wider_light(client: TestClient):
     (study,) = client.get("/v1/studies").json()["items"]
     assert study["verdict"] == "effect"
@@ -94,7 +94,7 @@ def test_a_study_of_the_hazy_days_finds_wider_light(client: TestClient):
     assert found["name"] in ("sun_shape", "slope_error", "camera_blur")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_all_jobs_are_done(client: TestClient):
     jobs = client.get("/v1/jobs").json()["items"]
     assert {one["state"] for one in jobs} == {"done"}

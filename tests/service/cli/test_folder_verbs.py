@@ -33,7 +33,7 @@ def succeeds_but_for(heliostat: str, *arguments: object) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_flux_predict_and_forecast_on_a_made_plant(pair_plant, tmp_path):
     names = sorted(read_folder(pair_plant).plant.heliostats)
 
@@ -326,7 +326,7 @@ def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_p
     assert len(nothing.stderr.strip().splitlines()) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, pair_plant):
     """On one plant and then on another under the same folder, as README has it.
 

@@ -59,7 +59,7 @@ def service_of(checkout: Path, plant: Path) -> Iterator[httpx.Client]:
         yield client
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("damaged", [WEIGHTS.name, PRIOR.name])
 def test_damaged_weights_predict_nothing_and_everything_else_goes_on(
     damaged: str, pair_plant: Path, tmp_path: Path

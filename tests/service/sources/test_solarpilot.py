@@ -9,7 +9,7 @@ from benchmarks import solarpilot
 pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 'peers'")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:DatetimeIndex.dayofyear")  # in pvlib, by pandas 3
 def test_efficiency_is_solarpilots(tmp_path: Path):
     theirs = solarpilot.laid_out(20.0)

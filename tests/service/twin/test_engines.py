@@ -66,7 +66,7 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
     np.testing.assert_array_equal(made.irradiance, expected.irradiance)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
     task = KernelTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
     kernels, expected = (
@@ -79,7 +79,7 @@ def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
         assert torch.equal(getattr(kernels, name), getattr(expected, name))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any, tmp_path: Path):
     task, parts = Superposition(target(10.0), JUELICH_MODEL, (32, 32)), some_tiles()
     expected = superpose(task, parts, Threads(1))
@@ -113,7 +113,7 @@ def test_cluster_gives_the_same_light_also_where_a_worker_is_killed(cluster: Any
     assert total.power == pytest.approx(expected.power, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("store_url", ["sqlite"], indirect=True)
 def test_service_forecasts_on_the_cluster(cluster: Any, field: Any):
     runtime = runtime_of(field)

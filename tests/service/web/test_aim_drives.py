@@ -15,7 +15,7 @@ from service.twin.transfer.importing import import_folder
 from tests.service import real
 from tests.service.sources.plant_folder import write_plant_folder
 
-pytestmark = [pytest.mark.slow]
+pytestmark = [pytest.mark.full]
 
 OFFSET = [60.0, -40.0]
 """Steps by which the motors of A1 differ from the nominal ones, in its photographs."""

@@ -78,7 +78,7 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         yield client
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(("name", "facets", "width"), [("A1", 28, 12.72), ("B1", 3, 3.85)])
 def test_page_has_every_facet_in_its_outline(
     other: TestClient, name: str, facets: int, width: float
@@ -97,7 +97,7 @@ def test_page_has_every_facet_in_its_outline(
     assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR) is not None
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_mirrors_of_other_facets_are_not_compared(other: TestClient):
     """One with another number of facets was an error of the server."""
     answer = other.get("/compare?heliostat=A1&other=B1")

@@ -22,7 +22,7 @@ from tests.service import real
 from tests.service.sources.plant_files import RICH, write_plant
 from tests.service.sources.plant_folder import write_plant_folder
 
-pytestmark = [pytest.mark.slow]
+pytestmark = [pytest.mark.full]
 
 SUN = {"azimuth_deg": 150.0, "elevation_deg": 35.0}
 RECEIVERS = ("main", "board", "cave", "walls")

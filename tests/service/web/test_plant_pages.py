@@ -15,7 +15,7 @@ from tests.service import real
 from tests.service.sources.plant_folder import write_plant_folder
 from tests.service.web.crawling import crawl
 
-pytestmark = [pytest.mark.slow]
+pytestmark = [pytest.mark.full]
 
 
 @pytest.fixture(scope="module")
