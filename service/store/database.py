@@ -158,6 +158,7 @@ class Database:
 
     @contextmanager
     def _migrating(self) -> Iterator[Config]:
+        self.require_known()
         config = alembic_config()
         with _alembic, self._writer.connect() as connection:
             config.attributes["connection"] = connection
@@ -219,14 +220,24 @@ class Database:
         """Whether the schema is at the newest version that this code knows."""
         return self.revision() == _newest_revision()
 
+    def require_known(self) -> None:
+        """Raise `SchemaError` if another version of heliotwin made the schema."""
+        if (found := self.revision()) not in (None, *self.revisions()):
+            raise SchemaError(
+                f"{self.url}: another version of heliotwin made this store (schema {found}, not"
+                f" {_newest_revision()}); make it again: delete it, or set HELIOTWIN_DATA_DIR or"
+                " HELIOTWIN_DATABASE_URL to a new one"
+            )
+
     def require_current(self) -> None:
         """Raise `SchemaError` unless the schema is at the newest version that this code knows."""
+        self.require_known()
         if not self.is_current():
             raise SchemaError(
                 f"the store's schema is at {self.revision()}, this version works with"
-                f" {self.revisions()[-1]}: run `heliotwin migrate`, or the version that fits"
+                f" {_newest_revision()}: run `heliotwin migrate`"
             )
-        logger.info("the store's schema is at %s, its newest version", self.revisions()[-1])
+        logger.info("the store's schema is at %s, its newest version", _newest_revision())
 
     def close(self) -> None:
         """Close all pooled connections."""
@@ -252,21 +263,11 @@ def require_store(settings: Settings) -> None:
         )
 
 
-def migrate(settings: Settings, to: str = "head") -> str:
-    """Migrate the schema to version ``to``, newer or older, and return the resulting version.
-
-    Raises
-    ------
-    InvalidInputError
-        If this code knows no such version.
-    """
+def migrate(settings: Settings) -> str:
+    """Bring the schema to its newest version, and return that version."""
     database = Database(settings.database)
     try:
-        known = database.revisions()
-        if to not in (*known, "head"):
-            raise InvalidInputError(f"--to {to}: must be head or one of {', '.join(known)}")
-        is_back = to != "head" and database.revision() in known[known.index(to) :]
-        (database.downgrade if is_back else database.upgrade)(to)
+        database.upgrade()
         return database.revision() or "base"
     finally:
         database.close()

@@ -240,10 +240,10 @@ class MeasurementRow(Base):
     center_up_m: Mapped[float | None]
     arrays: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
-    sent_by: Mapped[str | None] = mapped_column(Text)  # See migration 0015.
+    sent_by: Mapped[str | None] = mapped_column(Text)
     corrected_at: Mapped[datetime | None]
     forecast_accuracy: Mapped[float | None]
-    forced: Mapped[str | None] = mapped_column(Text)  # See migration 0018.
+    forced: Mapped[str | None] = mapped_column(Text)
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)
     image: Mapped[ImageRow | None] = relationship(lazy="joined")

@@ -106,7 +106,7 @@ def unchanged(counts: dict[str, int]) -> dict[str, int]:
 def kept(client: Client) -> dict[str, Any]:
     """All that must come through an upgrade and a restoration."""
     names = [item["name"] for item in client.get("/v1/heliostats")["items"]]
-    jobs = [item["id"] for item in client.get("/v1/jobs")["items"]]  # in short, since revision 0007
+    jobs = [item["id"] for item in client.get("/v1/jobs")["items"]]  # without results
     heliostats = {
         name: {
             what: client.get(f"/v1/heliostats/{name}/{what}")

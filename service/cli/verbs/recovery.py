@@ -65,8 +65,7 @@ def restore(folder: Old, as_json: AsJson = False) -> None:
         manifest = put_back(settings, folder, step)
     _show(
         manifest,
-        f"restored from {manifest.made_at}: schema {manifest.revision}, {manifest.images} images;"
-        " `heliotwin migrate` brings the schema up to date",
+        f"restored from {manifest.made_at}: schema {manifest.revision}, {manifest.images} images",
         as_json,
     )
 

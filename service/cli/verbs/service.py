@@ -132,23 +132,15 @@ def worker(
 
 
 @app.command()
-def migrate(
-    to: Annotated[
-        str,
-        typer.Option(
-            help="An older revision to go back to; what only newer ones can hold is lost."
-        ),
-    ] = "head",
-    as_json: AsJson = False,
-) -> None:
-    """Bring the database to its newest schema, or back to an older one."""
+def migrate(as_json: AsJson = False) -> None:
+    """Bring the database to its newest schema."""
     from service.base.settings import Settings
     from service.store import database
 
     keep_private()
     settings = Settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    report = {"revision": database.migrate(settings, to)}
+    report = {"revision": database.migrate(settings)}
     show(report, as_json)
     console.print(f"the schema is at {report['revision']}", highlight=False)
 

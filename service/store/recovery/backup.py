@@ -32,6 +32,7 @@ from service.store.photographs.image_files import ImageStore
 
 _FORMAT = 1
 _MANIFEST, _SQLITE, _IMAGES, _LIST = "manifest.json", "database.sqlite", "images", "images.txt"
+_KEPT_IMAGES = "SELECT sha256 FROM images WHERE pruned_at IS NULL ORDER BY sha256"
 _CHUNK = 2**20
 
 
@@ -84,6 +85,7 @@ def back_up(settings: Settings, out: Path, step: Progress = no_progress) -> Mani
     try:
         if database.revision() is None:
             raise ConflictError("there is no store to back up: the database holds no schema")
+        database.require_known()
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         images = images_of(settings)
@@ -138,14 +140,6 @@ def _place(images: ImageStore, sha256: str, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def _kept_images(columns: Iterable[str]) -> str:
-    """SQL that lists images with files. Before schema 0007 this was all of them."""
-    return (
-        "SELECT sha256 FROM images"
-        f" {'WHERE pruned_at IS NULL ' if 'pruned_at' in columns else ''}ORDER BY sha256"
-    )
-
-
 def _list_images(folder: Path, digests: Iterable[str]) -> None:
     (folder / _LIST).write_text("".join(f"{sha256}\n" for sha256 in digests), encoding="ascii")
 
@@ -158,8 +152,7 @@ def _copy_sqlite(database: Database, folder: Path) -> _Copied:
     ):
         source.backup(copy)
         copy.execute("PRAGMA journal_mode=DELETE")  # Makes a single file.
-        columns = [row[1] for row in copy.execute("PRAGMA table_info(images)")]
-        _list_images(folder, (row[0] for row in copy.execute(_kept_images(columns))))
+        _list_images(folder, (row[0] for row in copy.execute(_KEPT_IMAGES)))
         return _Copied(copy.execute("SELECT version_num FROM alembic_version").fetchone()[0], {})
 
 
@@ -172,7 +165,7 @@ def _copy_postgres(database: Database, folder: Path) -> _Copied:
         tables = _tables(connection)
         for name, columns in tables.items():
             _copy_out(connection, name, columns, folder / f"{name}.copy.gz")
-        _list_images(folder, connection.scalars(text(_kept_images(tables["images"]))))
+        _list_images(folder, connection.scalars(text(_KEPT_IMAGES)))
     return _Copied(revision, tables)
 
 
@@ -219,7 +212,7 @@ def restore(settings: Settings, folder: Path, step: Progress = no_progress) -> M
     Raises
     ------
     InvalidInputError
-        If ``folder`` is not a complete back-up, or has another engine or a newer schema.
+        If ``folder`` is not a complete back-up, or has another engine or schema.
     ConflictError
         If the store is not empty.
     """
@@ -266,7 +259,7 @@ def _require_fit(manifest: Manifest, database: Database, folder: Path) -> None:
         )
     if manifest.revision not in database.revisions():
         raise InvalidInputError(
-            f"{folder} has schema {manifest.revision}; use the newer heliotwin that made it"
+            f"{folder} has schema {manifest.revision}; use the version of heliotwin that made it"
         )
 
 

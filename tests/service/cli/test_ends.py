@@ -15,13 +15,14 @@ from typing import Any
 import httpx
 import pytest
 from rich.console import Console
+from sqlalchemy import text
 
 from service.base.settings import Settings
 from service.cli import demo
 from service.cli import folder as verbs
 from service.cli.main import main
 from service.sources.folder import read_folder
-from service.store.database import migrate
+from service.store.database import Database, migrate
 from tests.forked import Output, forked_process
 from tests.service.command import ends, heliotwin_on, heliotwin_process
 from tests.service.conftest import free_port
@@ -57,7 +58,10 @@ def test_lists_take_no_lock_and_migrate_nothing(made_plant: Path, tmp_path: Path
         assert heliotwin_on(data, verb, "list").returncode == 0
     assert not data.exists()
     settings = Settings(data_dir=data)
-    assert migrate(settings, "0001")
+    assert migrate(settings)
+    database = Database(settings.database)
+    database.downgrade("base")
+    database.close()
     ends(heliotwin_on(data, "keys", "list"), 1, "heliotwin migrate")
     ends(
         heliotwin_on(data, "import", made_plant, HELIOTWIN_MIGRATE_ON_START="false"),
@@ -72,6 +76,26 @@ def test_lists_take_no_lock_and_migrate_nothing(made_plant: Path, tmp_path: Path
             assert heliotwin_on(data, verb, "list").returncode == 0
     finally:
         held.close()
+
+
+@pytest.mark.parametrize(
+    "verb",
+    ["serve", "worker", "migrate", "export", "backup", "check", "keys list", "models list"]
+    + ["models withdraw 1", "import"],
+)
+def test_a_store_of_an_earlier_schema_is_refused_in_one_line(
+    made_plant: Path, tmp_path: Path, verb: str
+):
+    settings = Settings(data_dir=tmp_path / "data")
+    database = Database(settings.database)
+    database.upgrade()
+    with database.writing() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '0025'"))
+    database.close()
+    folder = {"import": [made_plant], "export": [tmp_path / "a"], "backup": [tmp_path / "b"]}
+    arguments = [*verb.split(), *folder.get(verb, ())]
+    ends(heliotwin_on(settings.data_dir, *arguments), 1, "(schema 0025, not")
+    assert not (tmp_path / "a").exists()
 
 
 def test_an_open_door_is_refused_in_one_line(tmp_path: Path):

@@ -1,5 +1,6 @@
 """Migrations up, down and up again without drift, and transactions that wait their turn."""
 
+import hashlib
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -9,12 +10,16 @@ from pathlib import Path
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import URL, inspect, text
+from sqlalchemy.dialects import postgresql
 from sqlalchemy.exc import IntegrityError, StatementError
+from sqlalchemy.schema import CreateIndex, CreateTable
 
 from service import store
+from service.base.errors import SchemaError
 from service.store.columns import Base
-from service.store.database import Database
+from service.store.database import Database, alembic_config
 from service.store.tables import HeliostatRow
 from tests.waiting import WAIT_LIMIT_S, child_process
 
@@ -42,6 +47,34 @@ def test_migrated_schema_is_the_mapped_one(database: Database):
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection, opts={"compare_server_default": True})
         assert compare_metadata(context, Base.metadata) == []
+
+
+def test_the_only_migration_names_the_schema_it_makes():
+    """A store of another schema is refused by this name, until 1.0.0 is released."""
+    tables = Base.metadata.sorted_tables
+    lines = [str(CreateTable(table).compile(dialect=postgresql.dialect())) for table in tables]
+    lines += sorted(
+        str(CreateIndex(index).compile(dialect=postgresql.dialect()))
+        for table in tables
+        for index in table.indexes
+    )
+    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
+    (script,) = ScriptDirectory.from_config(alembic_config()).walk_revisions()
+    assert script.revision == digest, "set revision in migrations/versions/0001_store.py to this"
+
+
+def test_a_store_of_an_earlier_schema_is_left_alone(database: Database):
+    current = database.revision()
+    with database.writing() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '0025'"))
+    try:
+        for refused in (database.upgrade, database.require_current, database.require_known):
+            with pytest.raises(SchemaError, match=r"schema 0025, .*make it again"):
+                refused()
+        assert database.revision() == "0025"
+    finally:
+        with database.writing() as session:
+            session.execute(text("UPDATE alembic_version SET version_num = :it"), {"it": current})
 
 
 def test_two_processes_migrate_at_once(empty_url: URL):

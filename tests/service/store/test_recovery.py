@@ -18,7 +18,7 @@ from service.base.errors import ConflictError
 from service.base.settings import Settings
 from service.cli.main import app as cli
 from service.store.columns import Base
-from service.store.database import Database, migrate
+from service.store.database import Database
 from service.store.job_tables import JobRow, JobStepRow
 from service.store.jobs import queue
 from service.store.recovery.backup import back_up, images_of, restore
@@ -195,23 +195,6 @@ def test_back_up_of_another_engine_or_a_newer_schema_is_refused(
             restore(elsewhere, folder)
 
 
-def test_back_up_of_an_older_schema_comes_back_and_is_upgraded(
-    runtime: Runtime, elsewhere: Settings, tmp_path: Path
-):
-    runtime.database.downgrade("0003")
-    try:
-        assert back_up(runtime.settings, tmp_path / "one").revision == "0003"
-    finally:
-        runtime.database.upgrade()
-    elsewhere.data_dir.mkdir()
-    restore(elsewhere, tmp_path / "one")
-    assert migrate(elsewhere) == runtime.database.revisions()[-1]
-    database = Database(elsewhere.database)
-    with database.reading() as session:
-        assert len(session.scalars(select(MeasurementRow.id)).all()) == 5
-    database.close()
-
-
 # --- check
 # --------------------------------------------------------------------------------------------------
 
@@ -253,9 +236,7 @@ def test_verbs_of_the_command_line(
     assert done.exit_code == 0
     assert json.loads(done.stdout)["images"] == 5
     assert CliRunner().invoke(cli, ["check"]).exit_code == 0
-    assert CliRunner().invoke(cli, ["migrate", "--to", "0003", "--json"]).exit_code == 0
-    with pytest.raises(InvalidInputError, match="0001, 0002"):
-        CliRunner().invoke(cli, ["migrate", "--to", "nine"], catch_exceptions=False)
+    assert CliRunner().invoke(cli, ["migrate", "--json"]).exit_code == 0
     shutil.rmtree(folder)
 
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from sqlalchemy import URL, select, text
+from sqlalchemy import select
 
 from model.effects import CATALOGUE, acting, model_version
 from model.sunshape import Gaussian
@@ -22,7 +22,7 @@ from service.store import audit, keys
 from service.store.database import Database
 from service.store.job_tables import AuditRow
 from service.store.plant.model_versions import put_declared
-from service.store.tables import MODEL_VERSION, ModelRow
+from service.store.tables import MODEL_VERSION
 from service.twin.plant import model_versions
 from tests.service.command import exit_code
 from tests.service.conftest import ORIGIN, FakeOperations, Post, png
@@ -192,86 +192,6 @@ def test_of_those_who_adopt_at_once_one_is_first(database: Database):
 
 def test_name_of_a_model_with_every_effect_fits_its_column():
     assert len(model_version(kind() for kind in CATALOGUE.values())) + 10 <= MODEL_VERSION
-
-
-# --- the migration
-# --------------------------------------------------------------------------------------------------
-
-
-def test_what_was_stored_before_goes_up_and_down(empty_url: URL):
-    database = Database(empty_url)
-    database.upgrade("0002")
-    add_old = (
-        (
-            "INSERT INTO heliostats (id, name, properties, east_m, north_m, up_m, created_at,"
-            " updated_at) VALUES (1, 'A', '{}', 0, 0, 0, '2024-06-01', '2024-06-01')"
-        ),
-        (
-            "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source,"
-            " arrays) VALUES (1, 1, 1, '2024-06-01', '2024-06-01', 'measured', 'a')"
-        ),
-        (
-            "INSERT INTO surfaces (id, heliostat_id, version, created_at, valid_from, source,"
-            " arrays) VALUES (2, 1, 2, '2024-06-01', '2024-06-01', 'network', 'b')"
-        ),
-        (
-            "INSERT INTO forecasts (id, heliostat_id, surface_id, plane, sun_azimuth_deg,"
-            " sun_elevation_deg, dni_w_m2, normalised, rows, columns, peak_w_m2, power_w,"
-            " model_version, flux, created_at) VALUES (1, 1, 2, '{}', 0, 45, 1000, FALSE, 8, 8, 1,"
-            " 1, '1:none', 'f', '2024-06-01')"
-        ),
-    )
-    with database.writing() as session:
-        for statement in add_old:
-            session.execute(text(statement))
-    database.upgrade()
-    with database.writing() as session:
-        surfaces = session.execute(
-            text("SELECT version, model_version FROM surfaces ORDER BY version")
-        ).all()
-        assert surfaces == [(1, None), (2, "1:none")]
-        session.execute(text(f"UPDATE forecasts SET model_version = '{'2:' + 'x' * 200}'"))
-    database.downgrade("0002")
-    with database.reading() as session:
-        assert session.execute(text("SELECT count(*) FROM surfaces")).scalar() == 2
-        kept = session.execute(text("SELECT surface_id, model_version FROM forecasts")).one()
-        assert kept[0] == 2
-        assert kept[1].startswith("2:x")
-    database.upgrade()
-    database.close()
-
-
-def test_declared_models_go_up_and_down(empty_url: URL):
-    """All versions so far were made with what the plant declares; going back, that of the current
-    one is kept.
-    """
-    database = Database(empty_url)
-    database.upgrade("0005")
-    with database.writing() as session:
-        session.execute(text("INSERT INTO plant VALUES (1, 'p', 50, 6, 0, '{\"sun\": null}')"))
-        session.execute(
-            text(
-                "INSERT INTO studies (id, created_at, created_by, options, heliostats, model,"
-                " model_version, verdict, conclusion, report, skipped) VALUES (1, '2024-06-01',"
-                " 'x', '{}', '[]', 1, '1:none', 'effect', '', '{}', '{}')"
-            )
-        )
-        session.execute(
-            text("INSERT INTO models VALUES (2, '2:x', '[]', 1, '2024-06-01', 'x', NULL, NULL)")
-        )
-    database.upgrade()
-    with database.writing() as session:
-        row = session.get_one(ModelRow, 2)
-        assert row.declared == {"sun": None}
-        session.add(
-            ModelRow(number=3, version="3:none", effects=[], declared=DECLARED, adopted_by="x")
-        )
-    database.downgrade("0005")
-    with database.reading() as session:
-        assert session.execute(text("SELECT number FROM models")).scalars().all() == [2]
-        kept = session.execute(text("SELECT declared FROM plant")).scalar_one()
-        assert (json.loads(kept) if isinstance(kept, str) else kept) == DECLARED
-    database.close()
 
 
 # --- over HTTP
