@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all serve lint lock docs bench train network clean
+.PHONY: help install demo test test-all coverage serve lint lock docs bench train network clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -24,6 +24,9 @@ test: install ## what a change needs: units, routes, pages, one task of each use
 
 test-all: install ## every test: also PostgreSQL, faults, browsers, images, notebooks (25 minutes)
 	$(BIN)/pytest -n 3 --dist loadgroup $(ARGS)
+
+coverage: install ## lines that make test runs, and in .coverage by which tests; of make test-all: ARGS="-m ''"
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not full" --cov --cov-context=test $(ARGS)
 
 lock: install ## the image's packages with their hashes, in the versions of constraints.txt
 	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)

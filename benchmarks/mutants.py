@@ -13,6 +13,7 @@ import ast
 import copy
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -173,7 +174,7 @@ def measured(path: Path) -> CoverageData:
 def covering(data: CoverageData, mutant: Mutant) -> list[str]:
     """The tests that cover a mutant's line; those first that cover the fewest files."""
     contexts = data.contexts_by_lineno(str(ROOT / mutant.path)).get(mutant.line, [])
-    tests = {context.partition("|")[0] for context in contexts if context}
+    tests = {_test_of(context) for context in contexts if context}
     return sorted(tests, key=lambda test: (_breadths(data)[test], test))
 
 
@@ -183,8 +184,13 @@ def _breadths(data: CoverageData) -> Counter[str]:
     breadths: Counter[str] = Counter()
     for path in data.measured_files():
         lines = data.contexts_by_lineno(path).values()
-        breadths.update({one.partition("|")[0] for contexts in lines for one in contexts})
+        breadths.update({_test_of(one) for contexts in lines for one in contexts})
     return breadths
+
+
+def _test_of(context: str) -> str:
+    """The id of a test; a process that it started has another context than the test."""
+    return re.sub(r"(\|| \()(setup|run|call|teardown)\)?$", "", context)
 
 
 def killer(tests: list[str], copied: Path, workers: int) -> str | None:

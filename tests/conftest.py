@@ -21,6 +21,7 @@ import httpx
 import numpy as np
 import pytest
 import torch
+from coverage import Coverage
 from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks import data_folder
@@ -108,9 +109,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=order)
 
 
-def pytest_collection_finish() -> None:
-    """Spare the garbage collector what stays: modules and tests are millions of objects."""
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Spare the garbage collector what stays: modules and tests are millions of objects.
+
+    Where coverage is measured, it is that of processes that tests start, too.
+    """
     gc.freeze()
+    if Coverage.current() is not None:
+        os.environ["COVERAGE_PROCESS_START"] = str(session.config.rootpath / "pyproject.toml")
+        os.environ["COVERAGE_FILE"] = str(session.config.rootpath / ".coverage")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,10 +7,14 @@ library, which does nothing else: no thread runs in it when it is copied.
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+from coverage import Coverage
+
+_ROOT = Path(__file__).parents[1]
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["tests.preloaded"])
 
@@ -31,12 +35,29 @@ class Output:
 
 
 def _run(
-    target: Callable[..., None], environment: dict[str, str], output: Output, *arguments: str
+    target: Callable[..., None],
+    environment: dict[str, str],
+    output: Output,
+    is_measured: bool,
+    *arguments: str,
 ) -> None:
     os.environ.clear()
     os.environ.update(environment)
     output.redirect()
-    target(*arguments)
+    with _measured() if is_measured else nullcontext():
+        target(*arguments)
+
+
+@contextmanager
+def _measured() -> Iterator[None]:
+    """Coverage of this process, with the test that started it as its context."""
+    coverage = Coverage(_ROOT / ".coverage", config_file=str(_ROOT / "pyproject.toml"))
+    coverage.start()
+    try:
+        yield
+    finally:
+        coverage.stop()
+        coverage.save()
 
 
 class ForkedProcess:
@@ -49,9 +70,12 @@ class ForkedProcess:
         *arguments: str,
         output: Output,
     ) -> None:
-        given = (target, dict(environment), output, *arguments)
+        is_measured = Coverage.current() is not None
+        given = (target, dict(environment), output, is_measured, *arguments)
         self._process = _CONTEXT.Process(target=_run, args=given)
-        self._process.start()
+        with pytest.MonkeyPatch.context() as patch:  # the server of copies is not measured
+            patch.delenv("COVERAGE_PROCESS_START", raising=False)
+            self._process.start()
         assert self._process.pid is not None
         self.pid: int = self._process.pid
         self.returncode: int | None = None
