@@ -133,7 +133,7 @@ def test_times_order_photographs_and_surfaces_however_late_they_come(
 
 @promise(
     "lists by time have the photograph last, and no filter by time finds it",
-    "alarms asks for times",
+    "an alarm asks for times",
 )
 def test_without_a_time_lists_by_time_have_it_last(client: TestClient, post: Post):
     post(png(1), id="undated")
