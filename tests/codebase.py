@@ -49,8 +49,6 @@ WORDS = {
     "believe": r"\bbelie(?:ve|ves|ved|f)\b",
 }
 """Words of WORDS.md's left column, each with the pattern that finds it."""
-QUOTING = {Path(__file__), ROOT / "service/store/records.py"}
-"""Files that name old words: this list, and the columns of exports of older versions."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +112,11 @@ def old_words() -> Counter[str]:
 
 
 def texts() -> Iterator[str]:
-    """Code, pages and documents that people read; migrations and CHANGELOG name what was."""
-    read = {*PACKAGES, "tests", "benchmarks", "docker", "docs"} - {"migrations"}
-    folders = [ROOT / name for name in read]
+    """Code, pages and documents that people read."""
+    folders = [ROOT / name for name in (*PACKAGES, "tests", "benchmarks", "docker", "docs")]
     paths = {path for folder in folders for pattern in TEXTS for path in folder.rglob(pattern)}
     paths |= {ROOT / name for name in ("README.md", "RESULTS.md", "Makefile")}
-    for path in sorted(paths - QUOTING):
+    for path in sorted(paths - {Path(__file__)}):
         is_built = not {"generated", "guide"}.isdisjoint(path.parts)
         if ".min." not in path.name and not is_built:
             yield path.read_text()

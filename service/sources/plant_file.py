@@ -164,7 +164,7 @@ class _PlantReader:
             if sun.csr is not None:
                 with mistakes_at(self._place("sun", "csr")):
                     return Buie(chi_of_csr(sun.csr))
-            return Buie(sun.chi if sun.chi is not None else float(sun.circumsolar_ratio or 0))
+            return Buie(float(sun.chi or 0))
         if isinstance(sun, GaussianSun):
             return Gaussian(sun.sigma_mrad / 1e3)
         return Pillbox(sun.half_angle_mrad / 1e3)
@@ -234,10 +234,6 @@ class _PlantReader:
         return heliostats
 
     def _warnings(self, layout: list[PlacedHeliostat]) -> Iterable[str]:
-        sun = self.entries.sun
-        if isinstance(sun, BuieSun) and sun.has_old_name:
-            place = self._place("sun", "circumsolar_ratio")
-            yield f"{place}: is read as chi of Buie's formula; write chi, or csr for the true share"
         used = {placed.entry.type for placed in layout}
         for name in self.entries.heliostat_types:
             if name not in used:

@@ -521,21 +521,11 @@ class BuieSun(PlantPart):
         None, description="Of Buie's formula."
     )
     csr: Share | None = Field(None, description="True share of the light from the aureole.")
-    circumsolar_ratio: Annotated[Number, Field(ge=0, le=0.5)] | None = Field(
-        None,
-        description="The older name of chi; not the true share.",
-        json_schema_extra={"deprecated": True},
-    )
 
     @model_validator(mode="after")
     def _one_ratio(self) -> Self:
-        self.require_one("chi", "csr", *(["circumsolar_ratio"] * self.has_old_name))
+        self.require_one("chi", "csr")
         return self
-
-    @property
-    def has_old_name(self) -> bool:
-        """Whether chi is given by its older name."""
-        return self.circumsolar_ratio is not None
 
 
 SunEntry = Annotated[PillboxSun | GaussianSun | BuieSun, Field(discriminator="shape")]

@@ -4,30 +4,11 @@ from datetime import datetime
 from types import GenericAlias, NoneType, UnionType
 from typing import Annotated, Any, get_args, get_type_hints
 
-from pydantic import AliasChoices, ConfigDict, FailFast, Field, create_model
+from pydantic import ConfigDict, FailFast, Field, create_model
 from sqlalchemy import ColumnElement, LargeBinary, String, inspect
 
 from service.base.fields import Moment
 from service.store.columns import Base
-from service.store.tables import CorrectionRow, DecisionRow, StudyRow, SurfaceRow
-
-FORMER_NAMES: dict[tuple[type[Base], str], str] = {
-    (SurfaceRow, "is_candidate"): "set_aside",
-    (SurfaceRow, "warnings"): "doubts",
-    (SurfaceRow, "warned_since"): "doubted_since",
-    (SurfaceRow, "mahalanobis_distance"): "strangeness",
-    (SurfaceRow, "acknowledged_at"): "seen_at",
-    (SurfaceRow, "acknowledged_by"): "seen_by",
-    (DecisionRow, "became_active"): "taken",
-    (DecisionRow, "candidates_before"): "set_aside_before",
-    (DecisionRow, "created_at"): "made_at",
-    (DecisionRow, "created_by"): "made_by",
-    (CorrectionRow, "created_at"): "made_at",
-    (CorrectionRow, "created_by"): "made_by",
-    (StudyRow, "first_taken_at"): "taken_from",
-    (StudyRow, "last_taken_at"): "taken_to",
-}
-"""Names of columns in documents of versions before migration 0020, which are still read."""
 
 
 def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any:
@@ -55,9 +36,7 @@ def record(table: type[Base], without: tuple[str, ...] = (), **more: Any) -> Any
             and not isinstance(column.type, LargeBinary)
         ):
             (kind,) = get_args(hints[column.key])
-            names = AliasChoices(column.key, FORMER_NAMES.get((table, column.key), column.key))
-            default = None if column.nullable else ...
-            fields[column.key] = (_bounded(kind, column), Field(default, validation_alias=names))
+            fields[column.key] = (_bounded(kind, column), None if column.nullable else ...)
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
     return create_model(table.__name__, __config__=config, **{**fields, **more})
 

@@ -191,8 +191,7 @@ class MeasurementRow(Base):
     - ``center_right_m``, ``center_up_m`` are the centre of mass from the target's centre.
     - ``corrected_at`` is the time of the newest correction (`CorrectionRow`). An excluded
       measurement is not accepted, for the reason `excluded`.
-    - ``sent_by`` is the name of the sender's key, or of the user who imported it. Old rows have
-      none.
+    - ``sent_by`` is the name of the sender's key, or of the user who imported it.
     - ``forced`` is why it is stored although another heliostat has the same image.
     - ``forecast_accuracy`` [1] is that of the surface of its day, computed when the photograph
       arrived. That surface had not used the photograph.
@@ -432,7 +431,7 @@ class ForecastRow(Base):
     """A computed flux map: its inputs, npz ``flux`` (rows, columns) float32 [W/m2] and key figures.
 
     ``sun_at`` is the requested time, or None if the request gave a sun position. ``losses`` are
-    those of `service.twin.forecasts.watts.LightWatts`, or None if they were not computed.
+    those of `service.twin.forecasts.watts.LightWatts`.
     ``warnings`` are notes for readers of the forecast.
     """
 
@@ -457,7 +456,7 @@ class ForecastRow(Base):
     power_w: Mapped[float]
     center_right_m: Mapped[float | None]
     center_up_m: Mapped[float | None]
-    losses: Mapped[JsonObject | None]
+    losses: Mapped[JsonObject]
     model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
     warnings: Mapped[list[str] | None]
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)

@@ -6,11 +6,9 @@ import json
 import os
 import shutil
 import subprocess
-import tarfile
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +19,6 @@ from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, until
 
 ROOT = Path(__file__).parents[2]
-
-_PREVIOUS = """
-FROM {image}
-USER root
-COPY . /opt/previous
-RUN /opt/heliotwin/bin/pip install --no-deps --no-index --no-build-isolation --force-reinstall /opt/previous
-USER heliotwin
-"""
-
 
 # As the official images start: their program, its configuration, where it keeps what it knows, and
 # as whom.
@@ -149,41 +138,6 @@ def build_monitor(program: str, name: str, kind: str, folder: Path, image: str) 
     dockerfile = folder / "Dockerfile"
     dockerfile.write_text(_MONITOR.format(name=name, kind=kind), encoding="utf-8")
     return build(folder, dockerfile, image)
-
-
-def newest_revision() -> str:
-    """The schema's newest version, by the names of the migrations."""
-    return max(path.name[:4] for path in (ROOT / "migrations" / "versions").glob("[0-9]*.py"))
-
-
-def before_newest_schema() -> str | None:
-    """The last commit whose schema is the one before the newest; None where the history does not
-    reach so far.
-
-    Of the main line: a merge may have given a migration its number.
-    """
-    (path,) = (ROOT / "migrations" / "versions").glob(f"{newest_revision()}_*.py")
-    inside = str(path.relative_to(ROOT))
-    added = run(
-        "git", "log", "--first-parent", "-m", "--diff-filter=A", "--format=%H", "--", inside
-    ).split()
-    if not added:
-        return None
-    parent = ["git", "rev-parse", "--quiet", "--verify", f"{added[-1]}^"]
-    asked = subprocess.run(parent, cwd=ROOT, capture_output=True, text=True, check=False)
-    return asked.stdout.strip() or None
-
-
-def build_previous(commit: str, folder: Path, image: str) -> str:
-    """Build ``image`` with the code of an older commit."""
-    content = subprocess.run(
-        ["git", "archive", commit], cwd=ROOT, capture_output=True, check=True
-    ).stdout
-    with tarfile.open(fileobj=BytesIO(content)) as archive:
-        archive.extractall(folder, filter="data")
-    dockerfile = folder / "Dockerfile"
-    dockerfile.write_text(_PREVIOUS.format(image=image), encoding="utf-8")
-    return build(folder, dockerfile, f"{image}-previous")
 
 
 class Composition:

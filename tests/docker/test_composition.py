@@ -16,11 +16,7 @@ from typing import Any
 
 import httpx
 import pytest
-from numpy.typing import ArrayLike
 
-from model.frames import wgs84_to_enu
-from service.sources.paint_documents import azimuth_from_north
-from service.store.records import FORMER_NAMES
 from tests.docker.engine import binary
 from tests.waiting import until
 
@@ -45,17 +41,6 @@ def version(checkout: Path) -> Iterator[str]:
     engine.build_heliotwin(checkout, f"heliotwin:{tag}")
     yield tag
     engine.run("docker", "rmi", "--force", f"heliotwin:{tag}")
-
-
-@pytest.fixture(scope="module")
-def previous(version: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The tag of an image of the last code whose schema is older than the current one."""
-    commit = engine.before_newest_schema()
-    if commit is None:
-        pytest.skip("this checkout's history does not reach back to the schema before the newest")
-    engine.build_previous(commit, tmp_path_factory.mktemp("previous"), f"heliotwin:{version}")
-    yield f"{version}-previous"
-    engine.run("docker", "rmi", "--force", f"heliotwin:{version}-previous")
 
 
 @contextmanager
@@ -144,86 +129,6 @@ def test_image_starts_without_a_place_to_write(version: str):
     done = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True)
     assert "serve" in done.stdout
     assert done.stderr == ""
-
-
-_RENAMED = {former: name for (_, name), former in FORMER_NAMES.items()} | {
-    "target_name": "target",
-    "center_of_mass": "center_of_mass_m",
-}
-
-
-def in_present_names(old: Any, origin: ArrayLike) -> Any:
-    """An older version's response with the names and units of this one.
-
-    ``origin`` (3,) is the tower base in WGS84.
-    """
-    if isinstance(old, list):
-        return [in_present_names(entry, origin) for entry in old]
-    if not isinstance(old, dict):
-        return old
-    new = {_RENAMED.get(name, name): in_present_names(old[name], origin) for name in old}
-    if "sun_azimuth" in new:
-        azimuth_deg = azimuth_from_north(new.pop("sun_azimuth"))
-        new["sun"] = {"azimuth_deg": azimuth_deg, "elevation_deg": new.pop("sun_elevation")}
-    for name in {"focal_spot", "helios_spot"} & new.keys():
-        wgs84 = new.pop(name)
-        new[f"{name}_m"] = None if wgs84 is None else wgs84_to_enu(wgs84, origin).round(6).tolist()
-    if isinstance(version := new.get("model_version"), str):
-        new["model_version"] = int(version.partition(":")[0])
-    if new.get("valid_from") == "1970-01-01T00:00:00Z":
-        new["valid_from"] = None  # unknown
-    if "number" in new:  # a version of the plant's model
-        new["version"] = new.pop("number")
-    return new
-
-
-def changes(new: Any, old: Any, path: str = "") -> Iterator[str]:
-    """Where a newer version's response lacks or changes what the older one's says.
-
-    The newer response may have more fields.
-    """
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name, value in old.items():
-            yield from changes(new.get(name), value, f"{path}.{name}")
-    elif isinstance(old, list) and isinstance(new, list) and len(new) == len(old):
-        for number, (one, other) in enumerate(zip(new, old, strict=True)):
-            yield from changes(one, other, f"{path}[{number}]")
-    elif new != old:
-        yield f"{path}: {old!r:.80} became {new!r:.80}"
-
-
-@pytest.fixture
-def former(checkout: Path, previous: str, stj: Path) -> Iterator[Composition]:
-    """The composition of the version before."""
-    with composed(checkout, previous, stj) as running:
-        yield running
-
-
-def test_upgrade_from_the_previous_image(
-    former: Composition, version: str, stj: Path, backups: Path
-):
-    key = former.verb("keys", "create", "admin", "--role", "admin").strip()
-    with former.client(key) as client:
-        imported(client, stj)
-        client.post("/v1/heliostats/AA39/surfaces", {"method": "network"})
-        before = kept(client)
-    former.verb("backup", "/backup/before-upgrade", mounted=backups)
-    manifest = json.loads(
-        (backups / "before-upgrade" / "manifest.json").read_text(encoding="utf-8")
-    )
-    assert manifest["revision"] < engine.newest_revision()
-
-    former.environment["HELIOTWIN_VERSION"] = version
-    former.up()
-    former.verb("check")
-    assert former.inspect("service", "{{.Config.Image}}") == f"heliotwin:{version}"
-    with former.client(key) as client:
-        now = kept(client)
-        tower = json.loads((stj / "WRI1030197-tower-measurements.json").read_text(encoding="utf-8"))
-        before = in_present_names(before, tower["power_plant_properties"]["coordinates"])
-        assert not list(changes(now, before))
-        assert "images new" not in imported(client, stj)
-        predicts_and_forecasts(client)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, create_model
+from pydantic import BaseModel, Field, ValidationError, create_model
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
@@ -39,9 +39,7 @@ from service.base.fields import (
 from service.base.validation_messages import format_validation_error
 from service.sources.documents import parse_declared, read_json
 from service.sources.files import read_file
-from service.sources.paint_documents import azimuth_from_north
 from service.store import audit
-from service.store.columns import EPOCH
 from service.store.photographs.measurements import (
     EXCLUDED,
     PositionKey,
@@ -68,44 +66,8 @@ FOLDER = "history"
 # Values that the import measures again from the image, so the export omits them.
 _MEASURED = ("accepted", "reason", "quality", "warnings", "center_right_m", "center_up_m")
 _FILE = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,160}$")]
-_FORMER_FIELDS = {
-    "focal_spot": "focal_spot_wgs84",
-    "helios_spot": "helios_spot_wgs84",
-    "target_name": "target",
-    "sun_azimuth": "sun.azimuth_deg",
-    "sun_elevation": "sun.elevation_deg",
-}
-"""Fields of corrections in exports from before migration 0020."""
-
-
-def _from_north(azimuth: Any) -> Any:
-    return azimuth_from_north(azimuth) if isinstance(azimuth, int | float) else azimuth
-
-
-def _with_new_names(fields: Any) -> Any:
-    """Fields of a correction, by their present names."""
-    if not isinstance(fields, dict):
-        return fields
-    known = {_FORMER_FIELDS.get(name, name): value for name, value in fields.items()}
-    if "sun_azimuth" in fields:
-        known["sun.azimuth_deg"] = _from_north(fields["sun_azimuth"])
-    if isinstance(known.get("taken_at"), str):
-        known["taken_at"] = known["taken_at"].replace("+00:00", "Z")
-    return known
-
-
-def _with_sun(known: Any) -> Any:
-    """A photograph with its sun as an object; before migration 0020 it had PAINT's azimuth."""
-    if not isinstance(known, dict) or "sun_azimuth_deg" not in known:
-        return known
-    sun = {"azimuth_deg": _from_north(known["sun_azimuth_deg"])}
-    sun["elevation_deg"] = known.get("sun_elevation_deg")
-    return {name: known[name] for name in known if not name.startswith("sun_")} | {"sun": sun}
-
-
 _Object = dict[str, object]
-_Fields = Annotated[_Object, BeforeValidator(_with_new_names)]
-_Correction = record(CorrectionRow, before=(_Fields, ...), after=(_Fields, ...))
+_Correction = record(CorrectionRow)
 _Motor = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
 _Corners = dict[Literal["corners"], tuple[_Pixel, _Pixel, _Pixel, _Pixel]]
@@ -130,7 +92,7 @@ _Decision = record(DecisionRow, version=(int, ...))
 _Mount = record(MountRow)
 _History = create_model(
     "History",
-    photographs=(many(Annotated[_Photograph, BeforeValidator(_with_sun)]), ...),
+    photographs=(many(_Photograph), ...),
     surfaces=(many(_Surface), ...),
     decisions=(many(_Decision), ...),
     mounts=(many(_Mount), ...),
@@ -365,9 +327,6 @@ def load_heliostat(root: Path, name: str) -> Any:
     if not path.exists():
         return None
     given = _load(path, _History)
-    for surface in given.surfaces:  # older exports have 1970 for an unknown time
-        if surface.valid_from is not None and surface.valid_from <= EPOCH:
-            surface.valid_from = None
     _check_heliostat(given, path)
     return given
 

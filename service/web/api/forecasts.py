@@ -229,9 +229,7 @@ class ForecastSummary(BaseModel):
     center_of_mass_m: tuple[float, float] | None = Field(
         description="Right and up of the plane's centre [m]."
     )
-    losses: ForecastLosses | None = Field(
-        description="What becomes of the light; null: not computed, as the forecast is older."
-    )
+    losses: ForecastLosses = Field(description="What becomes of the light.")
     model_version: ModelNumber = Field(description="Version of the plant's model, see /v1/models.")
     created_at: CreatedAt
 

@@ -134,7 +134,7 @@ class WarningOut(BaseModel):
         default=None,
         description=(
             "Between the recorded sun and where it was at the recorded time [deg]; null: of another"
-            " type, or found by an older version."
+            " type."
         ),
     )
     like: str | None = Field(

@@ -71,8 +71,8 @@ def aim_view(runtime: Runtime, row: JobRow, step: int) -> AimView | None:
     chosen = min(step, len(steps) - 1)
     with runtime.database.reading() as session:
         packed = queue.checkpoint_arrays(session, row.id, step_name(chosen))
-    # Plans of older versions kept no steps.
-    arrays = unpack(row.arrays if packed is None else packed)
+    assert packed is not None
+    arrays = unpack(packed)
     size = result["plane"]["width"], result["plane"]["height"]
     listed = steps if "steps" in result else []
     lines = _timelines(listed, result.get("time_zone") or "UTC", row.payload["limit_w_m2"])

@@ -31,7 +31,6 @@ from service.base.fields import (
     plant_time_to_utc,
 )
 from service.base.names import NAME
-from service.base.validation_messages import format_validation_error
 from service.drawing import charts
 from service.drawing.templates import times_in_zone
 from service.jobs.enqueuing import enqueue
@@ -248,12 +247,7 @@ def _filled_as(session: Session, job: JobRow) -> ForecastForm:
     """The form from which a forecast of all heliostats was requested."""
     if job.kind != "forecasts":
         raise NotFoundError(f"job {job.id} is no forecast")
-    try:
-        asked = FleetForecastIn.model_validate(job.payload)
-    except ValidationError as error:
-        raise InvalidInputError(
-            f"job: what job {job.id} asked for is refused since: {format_validation_error(error)}"
-        ) from error
+    asked = FleetForecastIn.model_validate(job.payload)
     moment = asked.sun.at if isinstance(asked.sun, SunAt) else None
     sun = position_of(session, asked.sun)
     return ForecastForm.model_construct(
@@ -358,5 +352,5 @@ def get_forecast_page(
         if row.normalised
         else charts.irradiance_map(title, flux_of(row), size)
     )
-    chain = loss_chain(row.losses) if row.losses else []
+    chain = loss_chain(row.losses)
     return _page(request, runtime, choices, filled, forecast=row, flux=flux, chain=chain)

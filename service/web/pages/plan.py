@@ -121,12 +121,12 @@ class PlanForm(Model):
             raise RequestValidationError(error.errors()) from error
 
 
-def _likely(targets: list[str], name: str, zone: str) -> PlanForm:
+def _likely(targets: list[str], zone: str) -> PlanForm:
     """Defaults of the form: a day from morning to evening at the plant."""
     today = now().astimezone(ZoneInfo(zone)).replace(tzinfo=None)
     morning = plant_time_to_utc(today.replace(hour=6, minute=0, second=0, microsecond=0), zone)
     return PlanForm.model_construct(
-        name=name,
+        name="",
         target=next(iter(targets), ""),
         first_at=morning,
         last_at=morning + timedelta(hours=12),
@@ -170,8 +170,8 @@ class Step:
 
     @property
     def chains(self) -> list[tuple[LossStage, LossStage]]:
-        """Losses of the twin and of ideal mirrors, stage by stage; older plans have none."""
-        twin, ideal = self.twin.get("field"), self.ideal.get("field")
+        """Losses of the twin and of ideal mirrors, stage by stage; none without any light."""
+        twin, ideal = self.twin["field"], self.ideal["field"]
         return [] if not twin or not ideal else [*zip(chain(twin), chain(ideal), strict=True)]
 
 
@@ -224,17 +224,6 @@ def _energy(steps: list[Step], kind: str) -> float | None:
         if len(steps) > 1
         else None
     )
-
-
-def _stored_request(row: JobRow) -> PlanIn | None:
-    """The request of a plan, or None if it is no longer valid.
-
-    An older version may have accepted what this one refuses, such as more pixels in total.
-    """
-    try:
-        return PlanIn.model_validate(row.payload)
-    except ValidationError:
-        return None
 
 
 def _allowed_w_m2(row: JobRow) -> float | None:
@@ -308,7 +297,7 @@ def _day(session: Session, row: JobRow, at: int | None, zone: str) -> Day:
 
 
 def _context(
-    runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None, name: str = ""
+    runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None
 ) -> dict[str, object]:
     """The form, filled with a request or with defaults, and the list of plans."""
     zone = plant_time_zone(session, runtime.settings.time_zone)
@@ -316,7 +305,7 @@ def _context(
     targets = [*receivers, *(row.name for row in store.list_targets(session))]
     plans = store.list_plans(session, LISTED + 1, after)
     return {
-        "filled": _likely(targets, name, zone) if asked is None else _filled(asked),
+        "filled": _likely(targets, zone) if asked is None else _filled(asked),
         "in_zone": in_zone(zone),
         "zone": zone,
         "whens": WHENS,
@@ -364,9 +353,9 @@ def get_plan_page(
             raise NotFoundError(f"job {number} is no plan")
         zone = plant_time_zone(session, runtime.settings.time_zone)
         day = None if row.result is None else _day(session, row, at, zone)
-        context = _context(runtime, session, after, _stored_request(row), name=row.payload["name"])
-        asked = _stored_request(row)
-        aims = None if asked is None or day is None else aims_for(asked, zone)
+        asked = PlanIn.model_validate(row.payload)
+        context = _context(runtime, session, after, asked)
+        aims = None if day is None else aims_for(asked, zone)
     return render(
         request,
         "plan.html",

@@ -115,15 +115,6 @@ def test_suns(tmp_path: Path):
     assert sun("{shape: buie, chi: 0.05}").circumsolar_ratio == 0.05
     true_share = csr_of_chi(float(sun("{shape: buie, csr: 0.043}").circumsolar_ratio))
     assert true_share == pytest.approx(0.043)
-    assert sun("{shape: buie, circumsolar_ratio: 0.03}").circumsolar_ratio == 0.03
-
-
-def test_older_name_of_chi_warns(tmp_path: Path):
-    text = PLANT.replace(
-        "{shape: pillbox, half_angle_mrad: 4.65}", "{shape: buie, circumsolar_ratio: 0.03}"
-    )
-    (warning,) = read_plant(write_plant(tmp_path, text)).warnings
-    assert warning.startswith(f"{tmp_path / 'plant.yaml'}, line 21: sun.circumsolar_ratio: ")
 
 
 def test_what_effects_need_of_a_type_is_read_and_stored(tmp_path: Path):

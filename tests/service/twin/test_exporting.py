@@ -3,7 +3,6 @@ again.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -28,11 +27,9 @@ from service.base.arrays import pack
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.folder import read_folder, read_surface
-from service.sources.paint_documents import azimuth_from_south
 from service.sources.photograph import Photograph
 from service.store.columns import Base
 from service.store.pointing.mounts import add_mount
-from service.store.records import FORMER_NAMES
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import (
     AliasRow,
@@ -325,59 +322,6 @@ def test_second_import_changes_nothing(exported: tuple[Path, dict[str, Any]], ot
     assert done["counts"]["histories unchanged"] == 2
     assert not [name for name in done["counts"] if name.endswith(" new")]
     assert history_rows(other) == before
-
-
-def test_an_export_of_the_version_before_is_read(
-    exported: tuple[Path, dict[str, Any]], other: Runtime, tmp_path: Path
-):
-    """With the columns' names before migrations 0019 and 0020, and azimuths from south."""
-    folder = tmp_path / "before"
-    shutil.copytree(exported[0], folder)
-    import_folder(other, read_folder(exported[0]))
-    expected = history_rows(other)
-    names = set()
-
-    def rename(table: Any, entries: list[dict[str, Any]]) -> None:
-        for entry in entries:
-            for (owner, name), former in FORMER_NAMES.items():
-                if owner is table:
-                    entry[former] = entry.pop(name)
-                    names.add(former)
-
-    def with_former_fields(fields: dict[str, Any]) -> dict[str, Any]:
-        known = {"sun.azimuth_deg": "sun_azimuth", "target": "target_name"}
-        fields = {known.get(name, name): value for name, value in fields.items()}
-        if "sun_azimuth" in fields:
-            fields["sun_azimuth"] = azimuth_from_south(fields["sun_azimuth"])
-        return fields
-
-    for file in folder.glob("history/heliostats/*/history.json"):
-        document = json.loads(file.read_text())
-        rename(SurfaceRow, document["surfaces"])
-        rename(DecisionRow, document["decisions"])
-        for photograph in document["photographs"]:
-            sun = photograph.pop("sun")
-            photograph["sun_azimuth_deg"] = azimuth_from_south(sun["azimuth_deg"])
-            photograph["sun_elevation_deg"] = sun["elevation_deg"]
-            rename(CorrectionRow, photograph["corrections"])
-            for correction in photograph["corrections"]:
-                for when in ("before", "after"):
-                    correction[when] = with_former_fields(correction[when])
-        file.write_text(json.dumps(document))
-    plant = folder / "history" / "plant.json"
-    document = json.loads(plant.read_text())
-    rename(StudyRow, document["studies"])
-    plant.write_text(json.dumps(document))
-    assert names == set(FORMER_NAMES.values())
-    settings = Settings(data_dir=tmp_path / "third", **QUIET)
-    third = Runtime.from_settings(settings, FakeOperations())
-    try:
-        third.database.upgrade()
-        done = import_folder(third, read_folder(folder))
-        assert not [name for name in done["skipped"] if name.endswith("history")]
-        assert history_rows(third) == expected
-    finally:
-        third.close()
 
 
 def test_photograph_that_is_sent_again_is_known(

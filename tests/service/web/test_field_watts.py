@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import update
 
 from model.fleet import LOSSES
 from service.cli.field import FieldRequest, trace_field
 from service.sources.folder import read_folder
 from service.sources.plant_file import PlantDescription, read_plant
-from service.store.tables import ForecastRow
 from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
@@ -142,18 +140,6 @@ def test_losses_are_those_of_the_whole_plane_whatever_is_mapped(rich: TestClient
     )
     assert window["power_w"] < 0.9 * whole["power_w"]
     assert window["losses"] == pytest.approx(whole["losses"])
-
-
-def test_older_forecast_without_losses_says_so(rich: TestClient):
-    body = {"heliostat": "A1", "target": "board", "sun": SUN, "resolution": 32}
-    number = rich.post("/v1/forecasts", json=body).json()["id"]
-    with real.runtime_of(rich).database.writing() as session:
-        session.execute(
-            update(ForecastRow).where(ForecastRow.id == number).values(losses=None)
-        )  # as the migration leaves rows
-    assert rich.get(f"/v1/forecasts/{number}").json()["losses"] is None
-    words = Page(rich.get(f"/forecasts/{number}", headers=HTML).text).words
-    assert "Not computed: this forecast is older" in words
 
 
 def test_tower_shades_the_field(rich: TestClient):

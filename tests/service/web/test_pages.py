@@ -11,7 +11,6 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
-from service.store.jobs.queue import get_job
 from service.twin.alarms.field_filter import METRICS
 from service.web.app import create_app
 from service.web.auth import security
@@ -361,16 +360,6 @@ def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestCli
     assert (field_of(again, "heliostat"), field_of(again, "dni_w_m2")) == ("", "900")
     assert field_of(again, "moment") == "2026-06-21 11:36"
     assert pages.get("/forecast?job=1").status_code == 404
-    app: Any = pages.app
-    with app.state.runtime.database.writing() as session:
-        row = get_job(session, int(path.rpartition("/")[2]))
-        row.payload = {
-            **row.payload,
-            "resolution": [1, 1],
-        }  # as an older version may have accepted it
-    refused = pages.get(f"/forecast?job={row.id}")
-    assert refused.status_code == 422
-    assert f"what job {row.id} asked for is refused since: resolution" in refused.text
 
 
 def test_jobs_are_requested_followed_and_cancelled(pages: TestClient):

@@ -174,24 +174,6 @@ def test_plan_that_is_begun_again_goes_on_with_the_time_it_stood_at(
     assert {fleet["resolution"] for fleet in operations.fleets} == {(64, 64)}
 
 
-def test_plan_of_an_older_version_is_shown_although_it_would_be_refused_today(
-    app: FastAPI, two_heliostats: TestClient
-):
-    """It had more pixels than are allowed today, and its result no warnings."""
-    number = planned(app, two_heliostats, allowed_w_m2=1.5)["id"]
-    with app.state.runtime.database.writing() as session:
-        row = queue.get_job(session, number)
-        row.payload = {**row.payload, "resolution": [1024, 1024], "step_minutes": 5.0}
-        row.result = {
-            name: value
-            for name, value in row.result.items()
-            if name not in ("warnings", "ideal_surfaces")
-        }
-    page = text_of(two_heliostats, f"/plans/{number}")
-    assert "at 4 of 4 times" in page
-    assert 'value="June"' in page
-
-
 def test_plan_of_the_night_fails_with_its_reason(app: FastAPI, two_heliostats: TestClient):
     job = planned(app, two_heliostats, last_at="2026-06-21T02:30:00Z")
     assert job["state"] == "failed"
