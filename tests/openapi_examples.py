@@ -249,7 +249,10 @@ def predict(record: Recorder, root: Path) -> None:
     record.run("post_predictions_job", "/v1/jobs/predictions", images=4)
     record.run("post_imports_job", "/v1/jobs/imports", folder="plant")
     sent = {"file": ("plant.zip", zipped(root), "application/zip")}
-    record.call("post_import_upload", "POST /v1/jobs/imports/uploads", 201, files=sent)
+    uploads = "/v1/jobs/imports/uploads"
+    upload = record.call("post_import_upload", f"POST {uploads}", 201, files=sent)
+    record.call("list_import_uploads", f"GET {uploads}")
+    record.call("delete_import_upload", f"DELETE {uploads}/{upload['folder']}", 204)
     record.examples["post_import_upload"]["body"] = {"file": "plant.zip"}
     active = record.client.get(f"{path}/current").json()["version"]
     choice = {"version": 1 if active > 1 else 2, "reason": "measured before it was canted again"}

@@ -102,14 +102,18 @@ def study_cost(session: Session, n_photographs: int, effects: Sequence[str] | No
     )
 
 
-def import_cost(session: Session, folder: Path) -> Cost:
-    """The cost of the images of a folder; at most 100,000 files are counted."""
+def count_images(folder: Path) -> int:
+    """The number of images of a folder; at most 100,000 files are counted."""
     files = islice(folder.rglob("*"), _MOST_FILES)
-    images = sum(path.suffix.lower() in _IMAGES for path in files)
+    return sum(path.suffix.lower() in _IMAGES for path in files)
+
+
+def import_cost(session: Session, n_images: int) -> Cost:
+    """The cost of the images of a folder."""
     return _cost(
         session,
         "imports",
-        images,
+        n_images,
         _IMPORT_S,
         lambda row: (row.result or {}).get("counts", {}).get("images new", 0),
     )

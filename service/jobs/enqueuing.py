@@ -19,6 +19,8 @@ def enqueue(
 ) -> JobRow:
     """Queue a job like `add_job`, audit it, and wake a worker of this process.
 
+    A payload that has only one job (`Kind.existing`) gets that job.
+
     Raises
     ------
     NotFoundError
@@ -30,6 +32,9 @@ def enqueue(
         kind.expected_s is not None and kind.expected_s(payload, runtime) <= settings.short_job_s
     )
     with runtime.database.writing() as session:
+        existing = kind.existing and kind.existing(session, payload, settings)
+        if existing:
+            return existing
         row, is_new = add_job(
             session, kind.name, document, actor, idempotency_key, bounds, is_short
         )

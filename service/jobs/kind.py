@@ -197,6 +197,8 @@ class Kind(Generic[Payload]):
     - ``so_far`` makes a result of the completed steps, for a job that did not finish.
     - ``details`` names the step with the part of the result that only the whole job shows.
     - ``require`` checks payload and settings before a job is queued.
+    - ``existing`` returns the job of a payload that has only one, None if it has none yet. It locks
+      out others that would queue it.
     - ``expected_s`` estimates the duration [s] from the payload and what is stored. A kind without
       it counts as long.
     """
@@ -209,6 +211,7 @@ class Kind(Generic[Payload]):
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
     details: str | None = None
     require: Callable[[Payload, Settings], object] | None = None
+    existing: Callable[[Session, Payload, Settings], JobRow | None] | None = None
     expected_s: Callable[[Payload, Runtime], float] | None = None
 
     def run(self, context: Context, document: Mapping[str, Any]) -> Result:

@@ -1,14 +1,18 @@
 """Measurement folders in ZIP files, from senders who are not trusted."""
 
+import errno
 import os
 import stat
+import struct
 import zlib
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from model.errors import InvalidInputError
+from service.base.errors import TooLargeError
 from service.base.names import escape_control_characters
 
 MAX_ENTRIES = 100_000
@@ -19,19 +23,31 @@ _MAX_NAME_BYTES = 255
 # What file managers add to folders.
 _LITTER = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
 
-_UNREADABLE = (BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
-# Of a name that is both a file and a folder.
-_AMBIGUOUS = (FileExistsError, NotADirectoryError, IsADirectoryError)
+# `zipfile` raises OverflowError for a place that no file can have.
+_UNREADABLE = (
+    *(BadZipFile, zlib.error, struct.error),
+    *(EOFError, RuntimeError, ValueError, OverflowError),
+)
+# Of a name that is both a file and a folder, and of a place before the file's begin.
+_UNREADABLE_ERRNOS = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EINVAL}
 
 
-def unpack_archive(file: IO[bytes], folder: Path, max_bytes: int) -> None:
+def unpack_archive(
+    file: IO[bytes],
+    folder: Path,
+    max_bytes: int,
+    admit: Callable[[int], object] = lambda size_bytes: None,
+) -> None:
     """Unpack the regular files of a ZIP file, without the top folder of all, into an empty folder.
+
+    ``admit`` is called with their total size before the first is written, and may raise.
 
     Raises
     ------
     InvalidInputError
-        If it is no ZIP file, has a file that must not be written, more than `MAX_ENTRIES`, or more
-        than ``max_bytes`` when unpacked.
+        If it is no ZIP file, or has a file that must not be written.
+    TooLargeError
+        If it has more than `MAX_ENTRIES`, or more than ``max_bytes`` when unpacked.
     """
     _require_few_entries(file)
     try:
@@ -39,16 +55,19 @@ def unpack_archive(file: IO[bytes], folder: Path, max_bytes: int) -> None:
             paths = {entry: _safe_path(entry) for entry in archive.infolist() if _is_wanted(entry)}
             size = sum(entry.file_size for entry in paths)
             if size > max_bytes:
-                raise InvalidInputError(
+                raise TooLargeError(
                     f"file: {size} bytes unpacked, {max_bytes} are the most; zip fewer heliostats"
                 )
+            admit(size)
             top = os.path.commonpath([str(path.parent) for path in paths.values()] or ["."])
             for entry, path in paths.items():
                 entry.filename = str(path.relative_to(top))
                 archive.extract(entry, folder)
     except InvalidInputError:
         raise
-    except (*_UNREADABLE, *_AMBIGUOUS) as error:
+    except (*_UNREADABLE, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in _UNREADABLE_ERRNOS:
+            raise  # the disk's
         reason = str(error).replace(str(folder), "")
         raise InvalidInputError(
             f"file: no readable ZIP file ({reason}); choose a .zip file of the folder"
@@ -59,7 +78,7 @@ def _require_few_entries(file: IO[bytes]) -> None:
     """Count the entries before ``ZipFile`` reads all of them into memory."""
     count = sum(part.count(_SIGNATURE) for part in iter(partial(file.read, 2**20), b""))
     if count > MAX_ENTRIES:
-        raise InvalidInputError(f"file: more than {MAX_ENTRIES} entries; zip fewer heliostats")
+        raise TooLargeError(f"file: more than {MAX_ENTRIES} entries; zip fewer heliostats")
 
 
 def _is_wanted(entry: ZipInfo) -> bool:

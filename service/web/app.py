@@ -15,6 +15,7 @@ from service.base.metrics import serve_metrics
 from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
+from service.jobs.uploads import delete_unused_uploads
 from service.jobs.worker import Workers
 from service.store.database import Database
 from service.twin.alarms.counts import AlarmCount
@@ -109,6 +110,7 @@ def create_app(
         runtime = await to_thread.run_sync(Runtime.from_settings, settings, operations)
         try:
             await to_thread.run_sync(require_fit, settings, runtime.database)
+            await to_thread.run_sync(delete_unused_uploads, runtime)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldOverviewCache(runtime)
             app.state.alarms = AlarmCount(runtime, app.state.field)

@@ -1,10 +1,11 @@
 """The job `imports`: load a measurement folder into the store."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
+from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from service.base.errors import ConflictError
@@ -12,8 +13,11 @@ from service.base.fields import Model, Text
 from service.base.progress import Steps
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
+from service.jobs.uploads import content_of, find_upload, import_of
 from service.sources.files import confined_to
 from service.sources.folder import MeasurementFolder, read_folder
+from service.store.job_tables import JobRow
+from service.store.rows import serialize_writers
 from service.twin.transfer.importing import Imported, import_folder
 
 
@@ -29,11 +33,15 @@ class ImportIn(Model):
     )
     uploaded: bool = Field(default=False, description="`folder` is the name of an uploaded one.")
 
+    @field_validator("folder")
+    @classmethod
+    def _normalise(cls, folder: str) -> str:
+        """`./stj` and `stj/` are `stj`."""
+        return str(PurePosixPath(folder))
 
-def allowed_root(settings: Settings, *, uploaded: bool = False) -> Path:
+
+def import_root(settings: Settings) -> Path:
     """The folder whose subfolders may be imported; ConflictError if the operator allowed none."""
-    if uploaded:
-        return settings.uploads_dir
     if settings.import_root is None:
         raise ConflictError(
             "no folder may be imported: the operator sets HELIOTWIN_IMPORT_ROOT first"
@@ -55,10 +63,31 @@ def allowed_folder(root: Path, folder: str) -> Path:
     # disk.
     if not path.is_relative_to(top) or not path.is_dir():
         raise InvalidInputError(
-            f"folder: there is no folder {folder!r} under the one that may be imported; an uploaded"
-            " one is deleted after its import, or after a day"
+            f"folder: there is no folder {folder!r} under the one that may be imported"
         )
     return path
+
+
+def _require_folder(payload: ImportIn, settings: Settings) -> None:
+    if not payload.uploaded:
+        import_root(settings)
+
+
+def _job_of_upload(session: Session, payload: ImportIn, settings: Settings) -> JobRow | None:
+    """The job of an upload, or None if it has none yet.
+
+    Raises
+    ------
+    NotFoundError
+        If there is neither the job nor the upload.
+    """
+    if not payload.uploaded:
+        return None
+    serialize_writers(session)
+    job = import_of(session, [payload.folder]).get(payload.folder)
+    if job is None:
+        find_upload(settings, payload.folder)
+    return job
 
 
 def import_allowed(context: Context, payload: ImportIn) -> Result:
@@ -66,9 +95,14 @@ def import_allowed(context: Context, payload: ImportIn) -> Result:
 
     Files that cannot be read, or that a link leads to outside of the allowed folder, are skipped.
     """
-    root = allowed_root(context.runtime.settings, uploaded=payload.uploaded)
+    settings = context.runtime.settings
+    if payload.uploaded:
+        root = folder = content_of(settings, payload.folder)
+    else:
+        root = import_root(settings)
+        folder = allowed_folder(root, payload.folder)
     with confined_to(root):
-        return _import(context, read_folder(allowed_folder(root, payload.folder), whole_field=True))
+        return _import(context, read_folder(folder, whole_field=True))
 
 
 def _import(context: Context, folder: MeasurementFolder) -> Result:
@@ -96,5 +130,6 @@ KIND = Kind(
     import_allowed,
     "Load a measurement folder into the store.",
     so_far=_until_then,
-    require=lambda payload, settings: allowed_root(settings, uploaded=payload.uploaded),
+    require=_require_folder,
+    existing=_job_of_upload,
 )

@@ -1,6 +1,5 @@
 """Image files: stored once under their SHA-256, written atomically."""
 
-import fcntl
 import hashlib
 import logging
 import os
@@ -11,6 +10,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from service.base.errors import StoreDamagedError, UnsupportedImageError
+from service.base.file_locks import file_lock
 
 logger = logging.getLogger("heliotwin.service")
 
@@ -156,34 +156,19 @@ class ImageStore:
 
         For readers of all images that the rows name.
         """
-        with self._lock_file() as descriptor:
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
+        with file_lock(self._lock(), shared=True):
             yield
 
     @contextmanager
     def removing(self) -> Iterator[bool]:
         """Lock for deletions: yields False if a reader uses `held`."""
-        with self._lock_file() as descriptor:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                yield False
-            else:
-                yield True
+        with file_lock(self._lock(), wait=False) as is_free:
+            yield is_free
 
-    @contextmanager
-    def _lock_file(self) -> Iterator[int]:
-        """Open a lock file outside the image folder. The lock ends with its process, even if
-        killed.
-        """
+    def _lock(self) -> Path:
+        """Path of the lock file, outside the image folder."""
         self.root.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(
-            self.root.with_name(f"{self.root.name}.lock"), os.O_CREAT | os.O_RDWR, 0o644
-        )
-        try:
-            yield descriptor
-        finally:
-            os.close(descriptor)
+        return self.root.with_name(f"{self.root.name}.lock")
 
     def _opened(self, sha256: str) -> BufferedReader:
         try:

@@ -21,12 +21,12 @@ from pydantic import Field
 
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
-from service.base.fields import Rows, State, Version
+from service.base.fields import Rows, State, Text, Version
 from service.drawing.pictures import flux_picture
 from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
 from service.jobs.kinds.plans import MAX_TIMES, map_name
-from service.jobs.uploads import UploadedFolder, receive_upload
+from service.jobs.uploads import UploadedFolder, delete_upload, list_uploads, receive_upload
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.listing import Order, Period
@@ -224,13 +224,35 @@ def list_jobs(
 def post_import_upload(
     file: Annotated[UploadFile, File(description="ZIP file of a measurement folder.")],
     runtime: RuntimeDep,
+    identity: IdentityDep,
 ) -> UploadedFolder:
     """Upload a measurement folder for an import.
 
     `POST /v1/jobs/imports` imports it, with its `folder` and `uploaded`. It is deleted when its
     import has ended, or after a day without one.
     """
-    return receive_upload(runtime.settings, file.file, file.filename or "")
+    return receive_upload(runtime, file.file, file.filename or "", identity.name)
+
+
+@router.get("/imports/uploads", responses=problems(), dependencies=[READ])
+def list_import_uploads(runtime: RuntimeDep) -> Page[UploadedFolder]:
+    """List the uploaded measurement folders."""
+    return Page(items=list_uploads(runtime), next=None)
+
+
+@router.delete(
+    "/imports/uploads/{name}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    responses=problems(404, 409),
+    dependencies=[OPERATE],
+)
+def delete_import_upload(
+    name: Annotated[Text, Path(description="Name of the upload.")],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> None:
+    """Delete an uploaded measurement folder, unless a job is to import it."""
+    delete_upload(runtime, name, identity.name)
 
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])

@@ -9,13 +9,13 @@ from pydantic import model_validator
 
 from service import store
 from service.base.fields import FormMoment, Method, Model, Moment, Name, Text, drop_empty_fields
-from service.jobs.costs import calibration_cost, import_cost, prediction_cost
+from service.jobs.costs import calibration_cost, count_images, import_cost, prediction_cost
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import calibrations, imports, predictions
 from service.jobs.kinds.calibrations import CalibrationIn
-from service.jobs.kinds.imports import ImportIn, allowed_folder, allowed_root
+from service.jobs.kinds.imports import ImportIn, allowed_folder, import_root
 from service.jobs.kinds.predictions import PredictionsIn
-from service.jobs.uploads import read_upload, receive_upload
+from service.jobs.uploads import delete_upload, find_upload, list_uploads, receive_upload
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -75,10 +75,13 @@ def get_start_page(
 ) -> HTMLResponse:
     """Predictions, calibration, import and uploads, each with its expected cost."""
     settings = runtime.settings
-    folder = upload = None
-    if query.folder is not None:
-        folder = allowed_folder(allowed_root(settings, uploaded=query.uploaded), query.folder)
-        upload = read_upload(folder) if query.uploaded else None
+    upload = n_images = None
+    if query.folder is not None and query.uploaded:
+        upload = find_upload(settings, query.folder)
+        n_images = upload.n_images
+    elif query.folder is not None:
+        n_images = count_images(allowed_folder(import_root(settings), query.folder))
+    uploads = list_uploads(runtime)
     with runtime.database.reading() as session:
         if query.heliostat is not None:
             store.get_heliostat(session, query.heliostat)
@@ -88,8 +91,9 @@ def get_start_page(
             query=query,
             prediction=prediction_cost(session, query.heliostat, query.method),
             calibration=calibration_cost(session, query.heliostat),
-            importing=None if folder is None else import_cost(session, folder),
+            importing=None if n_images is None else import_cost(session, n_images),
             upload=upload,
+            uploads=uploads,
             folders=_folders(settings.import_root),
             limits=(settings.max_body_bytes_of_key, settings.max_unpacked_bytes),
         )
@@ -121,14 +125,22 @@ def post_imports_form(
     form: Annotated[ImportIn, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Enqueue the import of a folder, and go to the page of the job. An upload has one job."""
-    root = allowed_root(runtime.settings, uploaded=form.uploaded)
-    folder = allowed_folder(root, form.folder)
-    key = folder.name if form.uploaded else None
-    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name, key).id}")
+    if not form.uploaded:
+        allowed_folder(import_root(runtime.settings), form.folder)
+    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name).id}")
 
 
 @router.post("/imports/upload", dependencies=[OPERATE, Depends(accept_archive), COMPUTE_SLOT])
-def post_upload_form(file: Annotated[UploadFile, File()], runtime: RuntimeDep) -> Response:
+def post_upload_form(
+    file: Annotated[UploadFile, File()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
     """Unpack and check a ZIP file, and show what its import would cost."""
-    upload = receive_upload(runtime.settings, file.file, file.filename or "")
+    upload = receive_upload(runtime, file.file, file.filename or "", identity.name)
     return go_to(f"/jobs/start?folder={upload.folder}&uploaded=true#imports")
+
+
+@router.post("/imports/uploads/{name}/delete", dependencies=[OPERATE])
+def post_delete_upload_form(name: Text, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+    """Delete an upload."""
+    delete_upload(runtime, name, identity.name)
+    return go_to("/jobs/start#imports")

@@ -3,8 +3,12 @@
 import io
 import json
 import os
+import shutil
 import stat
-import time
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_LZMA, ZipFile, ZipInfo
@@ -12,14 +16,19 @@ from zipfile import ZIP_LZMA, ZipFile, ZipInfo
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import URL, func, select
 
+from service.base.file_locks import file_lock
 from service.base.settings import Settings
+from service.jobs import uploads
 from service.jobs.uploads import delete_unused_uploads
 from service.sources import archive
+from service.store.job_tables import AuditRow, JobRow
+from service.web.app import create_app
 from tests.page import Page
-from tests.service import real
+from tests.service import access, real
 from tests.service.archives import zipped
-from tests.service.conftest import QUIET, paint_measurement, png
+from tests.service.conftest import QUIET, FakeOperations, client_of, paint_measurement, png
 from tests.service.web.pages import HTML, make_key
 
 PATH, UPLOADS = "/jobs/imports/upload", "/v1/jobs/imports/uploads"
@@ -76,7 +85,14 @@ def test_upload_is_counted_then_imported_then_deleted(
     result = client.get(f"/v1{starts[0].headers['Location']}").json()["result"]
     assert (result["counts"]["heliostats new"], result["counts"]["images new"]) == (1, 1)
     assert _stored(settings) == []
-    assert client.post("/jobs/imports", data=form).status_code == 422
+    again = client.post("/jobs/imports", data=form, follow_redirects=False)
+    assert again.headers["Location"] == starts[0].headers["Location"]
+
+
+def _make_old(upload: Path) -> None:
+    record = upload / "upload.json"
+    document = json.loads(record.read_text()) | {"created_at": "2024-06-01T12:00:00Z"}
+    record.write_text(json.dumps(document))
 
 
 def _entry(name: str, kind: int = stat.S_IFREG, method: int = 0) -> bytes:
@@ -117,7 +133,11 @@ def test_limits_of_size_and_entries(
     app: FastAPI, client: TestClient, folder: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (folder / "large").write_bytes(os.urandom(10**5))  # more than a photograph may have
-    assert "bytes unpacked, 100000 are the most" in _upload(client, zipped(folder)).text
+    too_large = _upload(client, zipped(folder))
+    assert (too_large.status_code, "bytes unpacked, 100000 are the most" in too_large.text) == (
+        413,
+        True,
+    )
     monkeypatch.setattr(archive, "MAX_ENTRIES", 7)
     assert "file: more than 7 entries" in _upload(client, zipped(folder)).text
     assert _upload(client, bytes(2 * 2**20), UPLOADS).status_code == 413
@@ -134,12 +154,202 @@ def test_unused_uploads_are_deleted(client: TestClient, settings: Settings, fold
         client.post("/v1/jobs/imports", json={"folder": name, "uploaded": True}).json()["id"]
         for name in names[:2]
     ]
-    old = time.time() - 25 * 3600
     for name in names:
-        os.utime(settings.uploads_dir / name, (old, old))
+        _make_old(settings.uploads_dir / name)
     delete_unused_uploads(real.runtime_of(client))
     assert {path.name for path in _stored(settings)} == set(names[:2])
     for job in jobs:
         client.post(f"/v1/jobs/{job}/cancel")
     assert _stored(settings) == []
     assert _upload(client, zipped(folder), UPLOADS).json()["n_measurements"] == 1
+
+
+@pytest.fixture
+def stored(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
+    """A service without heliostats, on each of the two databases."""
+    url = store_url.render_as_string(hide_password=False).replace("+psycopg", "")
+    options = Settings(data_dir=tmp_path / "data", database_url=url, **QUIET, **LIMITS)
+    with client_of(create_app(options, FakeOperations())) as client:
+        yield client
+
+
+def test_uploads_are_listed_and_deleted(client: TestClient, settings: Settings, folder: Path):
+    name = _upload(client, zipped(folder), UPLOADS).json()["folder"]
+    (listed,) = client.get(UPLOADS).json()["items"]
+    assert listed["size_bytes"] == sum(
+        path.stat().st_size for path in folder.rglob("*") if path.is_file()
+    )
+    counts = [listed[f"n_{what}"] for what in ("heliostats", "measurements", "images")]
+    assert (listed["folder"], counts, listed["job"]) == (name, [1, 1, 1], None)
+    page = Page(client.get("/jobs/start", headers=HTML).text)
+    assert name in page.one("table", id="uploads").words
+    job = client.post("/v1/jobs/imports", json={"folder": name, "uploaded": True}).json()["id"]
+    assert client.get(UPLOADS).json()["items"][0]["job"] == job
+    refused = client.delete(f"{UPLOADS}/{name}")
+    assert (refused.status_code, refused.json()["detail"]) == (
+        409,
+        f"job {job} imports the upload {name}; cancel it first",
+    )
+    client.post(f"/v1/jobs/{job}/cancel")
+    assert client.get(UPLOADS).json()["items"] == _stored(settings) == []
+    names = [_upload(client, zipped(folder), UPLOADS).json()["folder"] for _ in range(2)]
+    assert client.delete(f"{UPLOADS}/{names[0]}").status_code == 204
+    gone = client.post(f"/jobs/imports/uploads/{names[1]}/delete", follow_redirects=False)
+    assert gone.headers["Location"] == "/jobs/start#imports"
+    assert _stored(settings) == []
+    for name in (*names, "..", f".{names[0]}"):
+        assert client.delete(f"{UPLOADS}/{name}").status_code in (404, 405)
+    gone = client.post("/v1/jobs/imports", json={"folder": names[0], "uploaded": True})
+    assert (gone.status_code, "there is no upload" in gone.text) == (404, True)
+    with real.runtime_of(client).database.reading() as session:
+        deleted = select(AuditRow.subject).where(AuditRow.action == "upload.deleted")
+        assert session.scalars(deleted).all() == [f"upload {name}" for name in names]
+
+
+def test_each_key_has_a_share_of_uploads(app: FastAPI, client: TestClient, folder: Path):
+    """Its uploads do not shut out those of another key."""
+    first, second = (
+        access.bearer(access.make_key(app, name, "operate")) for name in ("one", "two")
+    )
+    data = zipped(folder)
+    for _ in range(uploads.MAX_UPLOADS_OF_KEY):
+        assert _upload(client, data, UPLOADS, headers=first).status_code == 201
+    refused = _upload(client, data, UPLOADS, headers=first)
+    assert refused.status_code == 429
+    assert "file: 5 uploads of one wait" in refused.json()["detail"]
+    assert _upload(client, data, UPLOADS, headers=second).status_code == 201
+    name = client.get(UPLOADS, headers=first).json()["items"][0]["folder"]
+    assert client.delete(f"{UPLOADS}/{name}", headers=first).status_code == 204
+    (folder / "large").write_bytes(os.urandom(95_000))
+    refused = _upload(client, zipped(folder), UPLOADS, headers=first)
+    assert (refused.status_code, "with 100000 bytes are the most" in refused.text) == (429, True)
+
+
+def test_upload_needs_space_for_its_folder_and_its_import(
+    client: TestClient, settings: Settings, folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What others are unpacking counts as taken, too."""
+    size = _upload(client, zipped(folder), UPLOADS).json()["size_bytes"]
+    usage = shutil.disk_usage(settings.data_dir)
+
+    def set_free(size_bytes: int) -> None:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=size_bytes))
+
+    set_free(2 * size - 1)
+    refused = _upload(client, zipped(folder), UPLOADS)
+    assert refused.status_code == 507
+    assert f"the disk of the service has {2 * size - 1} free" in refused.json()["detail"]
+    set_free(3 * size - 1)
+    (other,) = _stored(settings)
+    other.rename(other.with_name(f".{other.name}"))
+    assert _upload(client, zipped(folder), UPLOADS).status_code == 507
+    set_free(3 * size)
+    assert _upload(client, zipped(folder), UPLOADS).status_code == 201
+
+
+def test_upload_has_one_job_by_whatever_name(stored: TestClient, folder: Path):
+    """Eight confirmations at the same time, by two keys, with and without an Idempotency-Key."""
+    app: FastAPI = stored.app  # type: ignore[assignment]
+    bearers = [access.bearer(access.make_key(app, name, "operate")) for name in ("one", "two")]
+    name = _upload(stored, zipped(folder), UPLOADS, headers=bearers[0]).json()["folder"]
+
+    def confirm(number: int) -> str:
+        given = (name, f"./{name}", f"{name}/", f".//{name}/.")[number % 4]
+        headers = bearers[number % 2]
+        if number < 4:
+            form = {"folder": given, "uploaded": "true"}
+            answer = stored.post(
+                "/jobs/imports", data=form, headers=headers, follow_redirects=False
+            )
+            return str(answer.headers["Location"])
+        asked = headers | ({"Idempotency-Key": f"key-{number}"} if number > 5 else {})
+        answer = stored.post(
+            "/v1/jobs/imports", json={"folder": given, "uploaded": True}, headers=asked
+        )
+        assert answer.status_code == 202, answer.text
+        return str(answer.headers["Location"]).removeprefix("/v1")
+
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(confirm, range(8)))) == 1
+    runtime = real.runtime_of(stored)
+    with runtime.database.reading() as session:
+        assert session.scalar(select(func.count()).select_from(JobRow)) == 1
+    _make_old(runtime.settings.uploads_dir / name)
+    delete_unused_uploads(runtime)
+    assert len(stored.get(UPLOADS, headers=bearers[0]).json()["items"]) == 1
+    assert real.worker(stored).work()
+    assert stored.get("/v1/heliostats/AB01", headers=bearers[0]).status_code == 200
+    assert stored.get(UPLOADS, headers=bearers[0]).json()["items"] == []
+
+
+def test_import_of_a_server_folder_deletes_no_upload(
+    client: TestClient, settings: Settings, folder: Path
+):
+    name = _upload(client, zipped(folder), UPLOADS).json()["folder"]
+    object.__setattr__(settings, "import_root", folder)
+    client.post("/v1/jobs/imports", json={"folder": name})
+    assert real.worker(client).work()
+    assert [upload.name for upload in _stored(settings)] == [name]
+
+
+def test_page_of_an_upload_does_not_read_its_folder(
+    client: TestClient, settings: Settings, folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    name = _upload(client, zipped(folder), UPLOADS).json()["folder"]
+    shutil.rmtree(settings.uploads_dir / name / "content")
+    page = client.get(f"/jobs/start?folder={name}&uploaded=true", headers=HTML)
+    assert "1 more cannot be read" in page.text.replace("\xa0", " ")
+
+
+# Unpacks until it is killed.
+_UNPACKING = """
+import sys, time
+from pathlib import Path
+from service.base.settings import Settings
+from service.jobs import uploads
+from service.twin.runtime.runtime import Runtime
+uploads._count = lambda path: print("unpacked", flush=True) or time.sleep(600)
+runtime = Runtime.from_settings(Settings(data_dir=Path(sys.argv[1])), object())
+uploads.receive_upload(runtime, open(sys.argv[2], "rb"), "plant.zip", "tester")
+"""
+
+
+@pytest.mark.full
+def test_what_a_killed_process_unpacked_is_deleted_at_the_next_start(
+    app: FastAPI, settings: Settings, folder: Path, tmp_path: Path
+):
+    """Not what a living process is unpacking."""
+    with client_of(app):  # makes the database
+        pass
+    (tmp_path / "plant.zip").write_bytes(zipped(folder))
+    command = [
+        sys.executable,
+        "-c",
+        _UNPACKING,
+        str(settings.data_dir),
+        str(tmp_path / "plant.zip"),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "unpacked\n"
+            with client_of(create_app(settings, FakeOperations())) as client:
+                assert len(_stored(settings)) == 1
+                assert client.get(UPLOADS).json()["items"] == []
+        finally:
+            process.kill()
+    with client_of(create_app(settings, FakeOperations())):
+        assert _stored(settings) == []
+
+
+def test_left_overs_are_deleted_unless_a_process_works_on_them(
+    client: TestClient, settings: Settings
+):
+    for name in (".dead", ".alive", "without-record"):
+        (settings.uploads_dir / name).mkdir(parents=True)
+    (settings.uploads_dir / "file").touch()
+    with file_lock(settings.uploads_dir / ".alive" / "lock"):
+        delete_unused_uploads(real.runtime_of(client))
+        assert [path.name for path in _stored(settings)] == [".alive"]
+    delete_unused_uploads(real.runtime_of(client))
+    assert _stored(settings) == []

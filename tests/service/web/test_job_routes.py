@@ -323,7 +323,7 @@ def test_import_never_leaves_its_root(bare: TestClient, settings: Settings, fold
     (root / "link").symlink_to(settings.data_dir)
     job = finish(bare, bare.post("/v1/jobs/imports", json={"folder": folder}))
     assert job["state"] == "failed"
-    reason = f"folder: there is no folder {folder!r} under the one that may be imported; "
+    reason = f"folder: there is no folder {folder!r} under the one that may be imported"
     assert job["reason"].startswith(reason)
 
 
