@@ -23,7 +23,7 @@ from service.web.app import create_app
 from service.web.auth import dependencies, security
 from service.web.auth.rate_limiter import RateLimiter
 from service.web.auth.security import COOKIE, Role
-from tests.service.access import all_routes, bearer, make_key, withdraw
+from tests.service.access import bearer, make_key, withdraw
 from tests.service.command import exit_code
 from tests.service.conftest import (
     QUIET,
@@ -116,21 +116,27 @@ def guarded(
 
 
 def ask(client: TestClient, method: str, path: str, headers: dict[str, str]) -> Any:
-    path = path.replace("{path:path}", "index.html")
-    filled = path.format(name="AA39", measurement="1", number="999", version="999", view="crop")
     body = {"content": b"{}"} if method in ("POST", "PUT") else {}
     return client.request(
-        method, filled, headers={"Content-Type": "application/json", **headers}, **body
+        method,
+        path.format(name="AA39"),
+        headers={"Content-Type": "application/json", **headers},
+        **body,
     )
 
 
-def test_there_are_routes():
-    assert len(all_routes()) > 20
-    assert ("POST", "/v1/heliostats/{name}/measurements") in all_routes()
-
-
-@pytest.mark.parametrize(("method", "path"), all_routes())
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", "/heliostats/{name}"),
+        ("GET", "/v1/heliostats"),
+        ("POST", "/v1/heliostats/{name}/measurements"),
+        ("PUT", "/v1/heliostats/{name}"),
+        ("GET", "/v1/audit"),
+    ],
+)
 def test_route_lets_in_those_it_should(guarded: Any, method: str, path: str):
+    """A page and one route of each role; the role of every route is below."""
     app, client, made = guarded
     needed = security.declared_roles(app)[method, path]
     assert needed is not None
@@ -157,7 +163,9 @@ def test_route_lets_in_those_it_should(guarded: Any, method: str, path: str):
 
 
 def test_roles_of_routes_are_those_documented(guarded: Any):
-    for (method, path), role in security.declared_roles(guarded[0]).items():
+    roles = security.declared_roles(guarded[0])
+    assert len(roles) > 100
+    for (method, path), role in roles.items():
         if security.is_public(path):
             assert role is None
         elif path in ("/v1/audit", "/plant/audit", "/plant/keys", "/plant/settings"):
