@@ -116,18 +116,6 @@ def test_properties_come_back_as_they_were(database: Database):
     assert list(found) == list(properties)
 
 
-def test_same_image_is_one_measurement(database: Database):
-    with database.writing() as session:
-        heliostat, target = setup(session)
-        first, is_new = store.add_measurement(session, heliostat, *new(target, external_id="7"))
-        again, is_new_again = store.add_measurement(
-            session, heliostat, *new(target, external_id="8")
-        )
-        assert (is_new, is_new_again) == (True, False)
-        assert first.id == again.id
-        assert store.counts(session)["measurements"] == 1
-
-
 def test_images_of_one_measurement_in_several_kinds(database: Database):
     with database.writing() as session:
         heliostat, target = setup(session)
@@ -288,23 +276,6 @@ def test_many_writers_of_one_heliostat_make_one(database: Database):
     with ThreadPoolExecutor(8) as pool:
         changes = list(pool.map(write, range(16)))
     assert sorted(changes) == [Change.NEW] + 15 * [Change.UNCHANGED]
-
-
-def test_many_writers_of_one_image_make_one_measurement(database: Database):
-    with database.writing() as session:
-        setup(session)
-
-    def write(_: int) -> tuple[int, bool]:
-        with database.writing() as session:
-            heliostat = store.get_heliostat(session, "AA39")
-            measurement = new(store.get_target(session, "lower"), external_id="7")
-            row, is_new = store.add_measurement(session, heliostat, *measurement)
-            return row.id, is_new
-
-    with ThreadPoolExecutor(8) as pool:
-        results = list(pool.map(write, range(16)))
-    assert len({identity for identity, _ in results}) == 1
-    assert sum(is_new for _, is_new in results) == 1
 
 
 def test_many_writers_of_one_measurement_in_other_kinds(database: Database):

@@ -29,6 +29,7 @@ from tests.service.conftest import (
     tower_document,
 )
 from tests.service.web.at_once import at_once
+from tests.service.web.promises import promise
 
 BASE = "/v1/heliostats/AA39/measurements"
 HTML = {"Accept": "text/html"}
@@ -80,6 +81,7 @@ def test_the_same_bytes_of_another_kind_are_refused(client: TestClient):
     assert post(id="205363", kind="cropped").status_code == 201
 
 
+@promise('If two heliostats do have one image, send it with `"force": true` and a `"reason"`.')
 def test_the_same_bytes_at_another_heliostat_are_refused_unless_forced(client: TestClient):
     post = poster(client)
     assert post(id="205363").status_code == 201
@@ -137,6 +139,10 @@ def test_of_two_kinds_at_once_one_is_stored(both: TestClient):
 # --------------------------------------------------------------------------------------------------
 
 
+@promise(
+    "`filled` names what was missing and this post brought, `ignored` what differs. It answers to"
+    " this `id`, too"
+)
 def test_sent_again_it_fills_what_was_missing_and_reports_what_it_ignored(client: TestClient):
     post = poster(client)
     first = post(temperature_c=20.0).json()
@@ -168,6 +174,7 @@ def test_sent_again_it_fills_what_was_missing_and_reports_what_it_ignored(client
     assert (body["id"], body["external_id"], body["temperature_c"]) == (first["id"], "205363", 20.0)
     by_its_id = client.get(f"{BASE}/205363").json()
     assert by_its_id == client.get(f"{BASE}/{first['id']}").json()
+    assert client.get(f"{BASE}/205363/flux").status_code == 200
     assert by_its_id["taken_at"] == "2024-05-01T10:00:00Z"
     assert (by_its_id["motor_position"], by_its_id["wind_speed_m_s"]) == ([30076, 37935], 3.0)
     (correction,) = client.get(f"{BASE}/205363/corrections").json()["items"]
@@ -187,16 +194,6 @@ def test_two_ids_of_one_image_both_answer(client: TestClient):
     assert post(id="second").json()["filled"] == []
     made = client.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["first", "second"]})
     assert (made.status_code, made.json()["measurements"]) == (201, ["first"])
-
-
-def test_an_id_of_another_image_is_not_taken(client: TestClient):
-    post = poster(client)
-    post(png(1), id="1")
-    post(png(2), id="2")
-    answer = post(png(1), id="2")
-    assert answer.status_code == 409
-    assert answer.json()["detail"].startswith("id: 2 is another image")
-    assert client.get(f"{BASE}/2").json()["image_sha256"] == digest(png(2))
 
 
 def test_filling_makes_a_raw_image_be_measured_again_with_its_corners(
@@ -296,6 +293,7 @@ def test_a_position_sent_again_is_filled(client: TestClient):
         {"focal_spot_m": spot_of(50.9133, 6.3878, 123.0)},
     ],
 )
+@promise("Without an image also another focal spot")
 def test_a_position_sent_again_with_other_values_is_refused(
     client: TestClient, changes: dict[str, Any]
 ):
@@ -312,6 +310,10 @@ def test_a_position_sent_again_with_other_values_is_refused(
         assert send_position(client, **first | changes).json()["focal_spot_m"] == value
 
 
+@promise(
+    "Without an image the `id` decides. Without an `id` it is the same measurement if target, sun"
+    " and motor position are the same and the times do not differ."
+)
 def test_a_position_without_an_id_is_known_by_its_values(both: TestClient):
     first = send_position(both).json()
     moment = "2024-05-01T10:00:00Z"

@@ -1,14 +1,13 @@
 """What the integrators' guide promises of photographs, repeats, identity, ids and times: a test for
-each promise.
+each promise, here or in `test_identity`.
 """
 
 import itertools
 import json
 import re
-from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 from fastapi import FastAPI
@@ -36,27 +35,11 @@ from tests.service.conftest import (
 )
 from tests.service.real import run_job
 from tests.service.spots import photographs
+from tests.service.web.promises import GUIDE, promise
 
-PAGE = "docs/how-to/integrator/photographs.md"
-GUIDE = " ".join((Path(__file__).parents[3] / PAGE).read_text(encoding="utf-8").split())
 BASE = "/v1/heliostats/AA39/measurements"
 MOMENT = "2024-06-01T09:14:03Z"
 SPOT = spot_of(50.9133, 6.3878, 122.9)
-
-Test = TypeVar("Test", bound=Callable[..., None])
-
-
-def promise(*sentences: str) -> Callable[[Test], Test]:
-    """Name the guide's sentences that a test holds the service to."""
-
-    def marked(test: Test) -> Test:
-        missing = [sentence for sentence in sentences if sentence not in GUIDE]
-        assert not missing, (
-            f"{PAGE} no longer says {missing}; change {test.__name__} with the guide"
-        )
-        return test
-
-    return marked
 
 
 @pytest.fixture
@@ -170,20 +153,6 @@ def test_without_a_time_it_is_never_the_newest(app: FastAPI, client: TestClient,
 
 # --- answers
 # --------------------------------------------------------------------------------------------------
-
-
-@promise(
-    "`filled` names what was missing and this post brought, `ignored` what differs. It answers to"
-    " this `id`, too"
-)
-def test_200_names_what_was_filled_and_ignored(client: TestClient, post: Post):
-    first = post(temperature_c=20.0).json()
-    again = post(temperature_c=25.0, taken_at=MOMENT, motor_position=[1, 2], id="205363")
-    assert again.status_code == 200
-    assert set(again.json()["filled"]) == {"taken_at", "motor_position", "id"}
-    assert again.json()["ignored"] == ["temperature_c"]
-    assert client.get(f"{BASE}/205363").json()["image_sha256"] == first["image_sha256"]
-    assert client.get(f"{BASE}/205363/flux").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -300,37 +269,6 @@ def test_measurement_is_independent_of_sender_repetition_and_order(
         assert known[-1] | {"external_id": ""} == known[0] | {"external_id": ""}
         assert document["external_id"] == f"n{seed}"
     assert len(listed(client)) == len(known) == 6
-
-
-@promise(
-    "Without an image the `id` decides. Without an `id` it is the same measurement if target, sun"
-    " and motor position are the same and the times do not differ.",
-    "Without an image also another focal spot",
-)
-def test_without_an_image_the_id_decides_or_the_values(client: TestClient):
-    document = metadata(kind="none", motor_position=[1, 2], focal_spot_m=SPOT)
-
-    def send(**changes: Any) -> int:
-        answer = client.post(BASE, files={"metadata": (None, json.dumps(document | changes))})
-        return int(answer.status_code)
-
-    assert [send(), send(), send(taken_at=MOMENT), send(taken_at=MOMENT)] == [201, 200, 200, 200]
-    assert send(taken_at="2024-06-02T09:14:03Z") == 201
-    assert [send(id="1", sun=sun_at(179.0)), send(id="1", sun=sun_at(179.0)), send(id="1")] == [
-        201,
-        200,
-        409,
-    ]
-    assert send(id="2", sun=sun_at(179.0)) == 201
-    assert send(id="2", sun=sun_at(179.0), focal_spot_m=spot_of(50.9133, 6.3878, 123.0)) == 409
-
-
-@promise('If two heliostats do have one image, send it with `"force": true` and a `"reason"`.')
-def test_two_heliostats_have_one_image_by_force(other: TestClient, post: Post):
-    post(id="1")
-    assert post(id="1", heliostat="AB38").status_code == 409
-    forced = post(id="1", heliostat="AB38", force=True, reason="both spots are on it")
-    assert (forced.status_code, forced.json()["forced"]) == (201, "both spots are on it")
 
 
 @promise(

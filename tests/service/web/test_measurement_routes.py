@@ -76,14 +76,6 @@ def test_same_image_is_one_measurement(client: TestClient, post: Post, operation
     assert len(client.get(BASE).json()["items"]) == 1
 
 
-def test_another_image_of_the_same_id_is_a_conflict(post: Post):
-    assert post(png(1), id="1").status_code == 201
-    answer = post(png(2), id="1")
-    assert answer.status_code == 409
-    assert answer.json()["detail"].startswith("id: ")
-    assert post(png(3), id="1", kind="raw").json()["id"] == "1-raw"
-
-
 def test_refused_image_is_kept_with_its_reason(client: TestClient, post: Post):
     image = png(refused=True)
     created = post(image)
