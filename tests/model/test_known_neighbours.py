@@ -73,6 +73,7 @@ OPTIONS = StudyOptions(
 )
 
 
+@pytest.mark.full
 def test_known_neighbours_are_found_before_their_rivals():
     found = study(photographs(KnownNeighbours(1.0)), MODEL, OPTIONS)
     assert [one.name for one in found.found] == ["known_neighbours"]

@@ -307,6 +307,7 @@ def test_what_one_heliostat_is_known_to_have_another_may_have():
     assert effect["parameters"]["sigma_mrad"]["value"] == pytest.approx(1.5, abs=0.1)
 
 
+@pytest.mark.full
 def test_a_mirror_that_is_canted_otherwise_is_found_by_name():
     report = study_to_json(
         found_in([replace(CANTED, scope=Always())], "facet_canting", "slope_error")
@@ -323,6 +324,7 @@ def test_what_is_always_there_is_not_dated():
     assert found["scope"] == {"kind": "set"}
 
 
+@pytest.mark.full
 def test_two_mirrors_recanted_on_different_days_are_both_found():
     other = FacetCanting(
         {"near": np.array([-1.0, 0.8, 0.6, -0.4])},

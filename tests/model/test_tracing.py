@@ -196,7 +196,13 @@ def test_area_weights_make_flux_independent_of_the_parametrisation():
 @pytest.mark.parametrize(
     ("position", "sun", "optics", "rays"),
     [
-        ((0.0, 60.0, 1.8), (25.0, 40.0), Optics(sun_shape=Buie(0.05)), 10_000_000),
+        pytest.param(
+            (0.0, 60.0, 1.8),
+            (25.0, 40.0),
+            Optics(sun_shape=Buie(0.05)),
+            10_000_000,
+            marks=pytest.mark.full,
+        ),
         (
             (60.0, 120.0, 1.8),
             (-60.0, 20.0),

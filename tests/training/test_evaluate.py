@@ -118,6 +118,7 @@ def test_the_exported_network_is_asked_as_the_product_asks_it(cases):
     assert z_std is not None
 
 
+@pytest.mark.full
 def test_tables_and_plots_of_an_evaluation(run, cases, tmp_path):
     mean = run.mean.double().numpy()
     methods = compared(run.folder, run.folder, mean)

@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 POOLS = """
 import json
 import service
@@ -31,6 +33,7 @@ def pools(**environment: str) -> dict[str, object]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.full
 def test_each_library_takes_one_thread_unless_it_is_told_otherwise():
     found = pools()
     assert set(found["pools"]) == {1}

@@ -118,6 +118,7 @@ def test_port_for_metrics_opens_and_closes(tmp_path: Path):
         pass
 
 
+@pytest.mark.full
 def test_worker_of_its_own_process_tells_of_its_jobs(tmp_path: Path):
     port = free_port()
     settings = Settings(data_dir=tmp_path / "data")

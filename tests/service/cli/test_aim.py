@@ -157,6 +157,7 @@ def test_a_quarter_of_the_pixels_has_the_same_light(plant: Path):
     assert float(some @ thin.kernels.areas) == pytest.approx(power, rel=0.01)
 
 
+@pytest.mark.full
 def test_uncertain_surfaces_widen_the_interval_of_the_peak(plant: Path, tmp_path: Path):
     known, uncertain = tmp_path / "known", tmp_path / "uncertain"
     for name, heliostat in read_plant(plant).plant.heliostats.items():

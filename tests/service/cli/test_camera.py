@@ -58,6 +58,7 @@ def test_another_camera_s_curve_is_found_and_makes_forecasts_agree(pair_plant, t
     assert np.abs(found - truth).max() < 0.02 < 0.06 < np.abs(usual - truth).max()
 
 
+@pytest.mark.full
 def test_photographs_that_tell_nothing_of_a_law_are_left_out_with_the_reason(made_plant, tmp_path):
     root = tmp_path / "plant"
     shutil.copytree(made_plant, root)

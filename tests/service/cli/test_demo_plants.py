@@ -27,6 +27,7 @@ def write_small(folder: Path, **changes: str) -> Path:
     return path
 
 
+@pytest.mark.full
 def test_mirrors_of_a_plants_file_are_photographed_and_found(tmp_path: Path):
     plant = write_small(tmp_path)
     done = heliotwin("demo", "--plant", plant, "--out", tmp_path / "out", "--json")

@@ -121,6 +121,7 @@ def test_version(tmp_path: Path):
     assert done.stdout.startswith("heliotwin")
 
 
+@pytest.mark.full
 def test_an_interrupted_prediction_leaves_what_was_done(
     made_plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -191,6 +192,7 @@ def test_what_listens_says_where_and_answers(tmp_path: Path):
         assert httpx.get(f"{url}/livez").status_code == 200
 
 
+@pytest.mark.full
 def test_the_last_line_of_the_demonstration_starts_the_service(tmp_path: Path):
     """As it is printed, whatever the folder is called."""
     printed = StringIO()

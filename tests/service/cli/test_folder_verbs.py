@@ -100,6 +100,7 @@ def test_an_out_that_cannot_be_a_folder_is_refused_first(tmp_path, verb, below):
     assert (tmp_path / "file").read_text() == "kept"
 
 
+@pytest.mark.full
 def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     """DESIGN.md, section 8: >= 0.855 in a 6 m window with measured surfaces and no effect; ideal
     ones far below.
@@ -217,7 +218,7 @@ def test_effects_of_a_studys_report_are_added_to_the_declared_ones(single_plant,
         )
 
 
-@pytest.mark.parametrize("number", [2, 5])
+@pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.full)])
 def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
     folder = undeclared / f"set-{number}"
     predictions = succeeds("predict", folder, "--out", tmp_path / "p")

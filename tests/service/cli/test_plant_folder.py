@@ -32,6 +32,7 @@ def test_folder_is_read_as_its_file_describes_it(folder: Path):
     assert list(read.plant.receivers) == ["main", "board"]
 
 
+@pytest.mark.full
 def test_flux_and_forecast_work_on_it(folder: Path, tmp_path: Path):
     done = heliotwin("flux", folder, "--out", tmp_path / "flux")
     assert done.returncode == 0, done.stderr

@@ -301,6 +301,7 @@ def test_a_wrong_clock_is_said_first(folder: Path, tmp_path: Path):
     assert f"clock: from {clock['since']} on the clock was" in " ".join(done.stderr.split())
 
 
+@pytest.mark.full
 def test_the_clock_of_real_photographs_is_right_until_it_is_put_wrong(stj_pointing: Path):
     plant = Plant([stj_pointing])
     wrong = with_clock(plant.readings, 19481.0, 1.0, plant.site)

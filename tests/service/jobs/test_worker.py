@@ -657,6 +657,7 @@ def process(runtime: Runtime) -> AbstractContextManager[ForkedProcess]:
     return forked_process(job_kinds.run, environment(runtime))
 
 
+@pytest.mark.full
 def test_job_of_a_killed_process_is_finished_by_another(runtime: Runtime):
     number = ask(runtime, value=9, steps=8, halts_at=2)
     with process(runtime) as first:
@@ -675,6 +676,7 @@ def test_job_of_a_killed_process_is_finished_by_another(runtime: Runtime):
     assert workers == {first.pid, os.getpid()}
 
 
+@pytest.mark.full
 def test_poison_that_kills_its_process_ends_failed(runtime: Runtime):
     number = ask(runtime, dies=99)
     for _ in range(3):
@@ -687,6 +689,7 @@ def test_poison_that_kills_its_process_ends_failed(runtime: Runtime):
     assert (row.reason or "").startswith("its worker was lost 3 times")
 
 
+@pytest.mark.full
 def test_stopped_process_puts_its_job_back(runtime: Runtime):
     number = ask(runtime, steps=2, halts_at=1)
     with process(runtime) as running:
@@ -697,6 +700,7 @@ def test_stopped_process_puts_its_job_back(runtime: Runtime):
     assert (row.state, row.attempts) == ("queued", 0)
 
 
+@pytest.mark.full
 def test_process_whose_job_hangs_ends_with_a_clear_word(runtime: Runtime):
     """What hangs cannot be ended but with its process; the other job is put back, and the next
     process does both.

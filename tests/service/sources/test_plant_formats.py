@@ -35,7 +35,9 @@ def pose_error_mrad(first: SolTraceInput, second: SolTraceInput) -> float:
     return float(1e3 * np.arctan2(sines, cosines).max())
 
 
-@pytest.mark.parametrize(("name", "count"), [(AFTERNOON, 2370), (SURROUND, 6282)])
+@pytest.mark.parametrize(
+    ("name", "count"), [(AFTERNOON, 2370), pytest.param(SURROUND, 6282, marks=pytest.mark.full)]
+)
 def test_soltrace_returns_as_it_came(tmp_path: Path, name: str, count: int):
     """Poses by our mounts from sun and aim points against those of the file."""
     before = parse_soltrace(published() / "soltrace" / name)
@@ -74,11 +76,11 @@ def test_aim_points_of_soltrace_are_on_its_receiver(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "count", "aims"),
     [
-        ("solarpilot/test_field.csv", 8661, 0),
+        pytest.param("solarpilot/test_field.csv", 8661, 0, marks=pytest.mark.full),
         ("halos/flat-daggett-50.csv", 656, 656),
         ("halos/radial-daggett-50.csv", 904, 904),
         ("opencsp/NSTTF_Heliostats_origin_at_torque_tube.csv", 218, 0),
-        ("layouts/Gemasolar_layout.csv", 2650, 0),
+        pytest.param("layouts/Gemasolar_layout.csv", 2650, 0, marks=pytest.mark.full),
         ("layouts/SolarTwo_layout.csv", 1926, 0),
     ],
 )

@@ -77,6 +77,7 @@ def test_a_store_of_an_earlier_schema_is_left_alone(database: Database):
             session.execute(text("UPDATE alembic_version SET version_num = :it"), {"it": current})
 
 
+@pytest.mark.full
 def test_two_processes_migrate_at_once(empty_url: URL):
     environment = os.environ | {
         "HELIOTWIN_DATABASE_URL": empty_url.render_as_string(hide_password=False)

@@ -229,6 +229,7 @@ def test_file_that_is_removed_while_it_is_posted_is_written_again(
     assert inspect_store(runtime.database, runtime.images, lambda _: None).is_sound
 
 
+@pytest.mark.full
 def test_post_and_pruning_at_once_leave_no_row_without_its_file(runtime: Runtime):
     aged, stop = with_(runtime, image_retention_days=90.0), threading.Event()
 

@@ -3,6 +3,7 @@ import os
 from collections import Counter
 from pathlib import Path
 
+import pytest
 from sqlalchemy import select
 
 from model.sunshape import Pillbox
@@ -18,6 +19,7 @@ from service.twin.transfer.importing import import_folder
 from tests.service.conftest import paint_measurement, properties_document, tower_document
 
 
+@pytest.mark.full
 def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
     """Every heliostat, image, position and measured surface of the real folder, once."""
     folder = read_folder(stj)

@@ -195,6 +195,7 @@ def day_plan_takes_the_aims(client: TestClient, job: dict[str, Any]) -> bool:
     return True
 
 
+@pytest.mark.full
 def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
     """By forms only: a plan exceeds the limit, aims are found, and a plan with them keeps it."""
     form = {
@@ -312,6 +313,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, name: str, then: Callable[[int], No
     return calls
 
 
+@pytest.mark.full
 def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
     body: dict[str, Any] = {"sun": {"azimuth_deg": 170, "elevation_deg": 50}}
     traces = counted(monkeypatch, "trace_kernels", lambda _: None)
@@ -343,6 +345,7 @@ def test_cancelled_day_ends_between_steps(plant: TestClient, monkeypatch: pytest
     assert (job["state"], job["result"], len(plans)) == ("cancelled", None, 2)
 
 
+@pytest.mark.full
 def test_stopped_day_goes_on_with_its_step(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
     path = plant.post("/v1/jobs/aim-plans", json=DAY).headers["Location"]
     worker = real.worker(plant)

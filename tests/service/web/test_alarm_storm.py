@@ -4,6 +4,8 @@ import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import pytest
+
 from service.base.settings import Settings
 from service.cli.demo_field import write_layout
 from service.sources.folder import read_folder
@@ -27,6 +29,7 @@ HTML = {"Accept": "text/html"}
 PATH = "/v1/alarms"
 
 
+@pytest.mark.full
 def test_storm_is_reduced_to_its_causes(tmp_path: Path):
     app = storm_app(tmp_path)
     make_storm(app, tmp_path)

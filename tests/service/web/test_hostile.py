@@ -330,6 +330,7 @@ def try_operation(cases: Any) -> None:
         check()
 
 
+@pytest.mark.full
 def test_no_request_that_the_document_allows_or_forbids_breaks_the_service(
     served: str, app: FastAPI
 ):

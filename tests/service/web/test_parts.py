@@ -67,6 +67,7 @@ def test_numbers_in_texts_have_their_units():
     ]
 
 
+@pytest.mark.full
 def test_every_table_and_figure_is_a_file(shown: TestClient):
     found = set()
     for path in PATHS:

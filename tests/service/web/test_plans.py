@@ -128,6 +128,7 @@ def test_plan_of_too_many_times_is_refused_without_making_them(
         assert answer.status_code == 422
 
 
+@pytest.mark.full
 def test_memory_of_a_plan_and_its_page_does_not_grow_with_its_times(
     app: FastAPI, two_heliostats: TestClient
 ):

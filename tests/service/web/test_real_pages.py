@@ -136,6 +136,7 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         yield client
 
 
+@pytest.mark.full
 def test_every_page_and_every_file_on_it_answers(every_study: TestClient):
     """All that can be reached by links from the first page; a figure of like pages once, for it is
     drawn for each.

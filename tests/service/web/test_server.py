@@ -48,6 +48,7 @@ def _environment(tmp_path: Path, port: int) -> dict[str, str]:
     }
 
 
+@pytest.mark.full
 def test_process_starts_answers_and_stops(tmp_path: Path):
     port = free_port()
     environment = _environment(tmp_path, port)
@@ -96,6 +97,7 @@ serve(Settings())
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGINT])
 def test_requests_for_the_model_get_retry_after_when_the_service_stops(
     tmp_path: Path, signal_number: signal.Signals
