@@ -9,14 +9,22 @@ BIN := $(VENV)/bin
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-$(VENV)/installed: pyproject.toml constraints.txt
+PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+
+$(VENV)/runtime: pyproject.toml constraints.txt
+	@echo "heliotwin and its guide are installed into $(VENV): about 2 minutes, 1.6 GB"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP_INSTALL) -e .
 	touch $@
 
-install: $(VENV)/installed ## the virtual environment with everything in it
+$(VENV)/installed: $(VENV)/runtime
+	@echo "what tests, linters and training need is installed into $(VENV): about 1 minute, 0.9 GB"
+	$(PIP_INSTALL) -e '.[dev]'
+	touch $@
 
-demo: install ## photographs in, mirror surfaces and flux forecasts out, under out/demo
+install: $(VENV)/installed ## the virtual environment with everything in it; demo and serve need less
+
+demo: $(VENV)/runtime ## photographs in, mirror surfaces and flux forecasts out, under out/demo
 	$(BIN)/heliotwin demo $(ARGS)
 
 test: install ## what a change needs: units, routes, pages, one task of each user, on SQLite (5 minutes)
@@ -31,10 +39,8 @@ coverage: install ## lines that make test runs, and in .coverage by which tests;
 lock: install ## the image's packages with their hashes, in the versions of constraints.txt
 	PATH=$(BIN):$$PATH $(BIN)/python docker/lock.py $(ARGS)
 
-docs: install ## the guide, into build/docs and into the service, which shows it on /docs/guide
-	$(BIN)/sphinx-build -W --keep-going -q -a -d build/doctrees -b html docs build/docs
-	rm -rf service/web/root/guide
-	cp -r build/docs service/web/root/guide
+docs: install ## the guide that the service shows on /docs/guide
+	$(BIN)/python -m docs.backend
 
 lint: install ## ruff, mypy, imports between packages, and limits of what makes code hard to read
 	$(BIN)/ruff check .
@@ -43,7 +49,7 @@ lint: install ## ruff, mypy, imports between packages, and limits of what makes 
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.codebase --check
 
-serve: install ## the service on http://127.0.0.1:8000
+serve: $(VENV)/runtime ## the service on http://127.0.0.1:8000
 	$(BIN)/heliotwin serve $(ARGS)
 
 bench: install ## the short benchmarks, into results/, and their figures into RESULTS.md and README
@@ -60,4 +66,4 @@ network: install ## the network of a heliostat type: make network PLANT=plant.ya
 	$(BIN)/python -m heliotwin.networks $(PLANT) --type $(TYPE) $(ARGS)
 
 clean: ## remove the virtual environment and everything that was made
-	rm -rf $(VENV) out build service/web/root/guide docs/reference/generated *.egg-info
+	rm -rf $(VENV) out build service/web/root/guide *.egg-info

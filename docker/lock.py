@@ -4,10 +4,10 @@ files.
     python docker/lock.py [TORCH_WHEEL ...]
 
 Versions are those of constraints.txt; hashes are those of the package index that uv asks. There is
-a file for all images, and one more for each kind of torch. The index has torch's wheels for
-graphics processors, which need more packages than constraints.txt has. Its wheels for other
-processors (+cpu) lie in another index: name the files that may be installed, as they were
-downloaded from there. Without a name the hashes that were locked before stay.
+a file for all images, one for what builds the guide, and one more for each kind of torch. The index
+has torch's wheels for graphics processors, which need more packages than constraints.txt has. Its
+wheels for other processors (+cpu) lie in another index: name the files that may be installed, as
+they were downloaded from there. Without a name the hashes that were locked before stay.
 """
 
 import hashlib
@@ -17,8 +17,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LOCK, CPU_LOCK, GPU_LOCK = (
-    ROOT / "docker" / f"requirements{kind}.lock" for kind in ("", "-cpu", "-gpu")
+LOCK, CPU_LOCK, GPU_LOCK, DOCS_LOCK = (
+    ROOT / "docker" / f"requirements{kind}.lock" for kind in ("", "-cpu", "-gpu", "-docs")
 )
 
 MACHINES = ("x86_64-manylinux_2_28", "aarch64-manylinux_2_28")
@@ -61,7 +61,7 @@ def write_entries(path: Path, about: str, entries: Entries) -> None:
     path.write_text(HEADER.format(about=about) + "\n".join(lines) + "\n", encoding="utf-8")
 
 
-def resolve(machine: str) -> Entries:
+def resolve(machine: str, *options: str) -> Entries:
     """All packages that the image needs on a machine, by uv."""
     command = [
         "uv",
@@ -71,9 +71,10 @@ def resolve(machine: str) -> Entries:
         "-c",
         "constraints.txt",
         "--python-version",
-        "3.11",
+        "3.11.5",
     ]
     command += [
+        *options,
         "--python-platform",
         machine,
         "--generate-hashes",
@@ -119,6 +120,11 @@ def main() -> None:
         },
         (CPU_LOCK, "torch without graphics processors:"): {
             f"{torch}+cpu": cpu_hashes(sys.argv[1:])
+        },
+        (DOCS_LOCK, "What builds the guide, besides:"): {
+            entry: hashes
+            for entry, hashes in resolve(MACHINES[0], "--extra", "docs").items()
+            if entry not in entries
         },
         (GPU_LOCK, "torch for graphics processors, and what only it needs:"): {
             entry: entries[entry] for entry in entries if names[entry] not in everywhere

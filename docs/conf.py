@@ -1,4 +1,4 @@
-"""Configuration of the documentation's site: ``make docs`` builds it."""
+"""Configuration of the guide: `docs.backend` builds it."""
 
 import sys
 from pathlib import Path
@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
-from docs import figures, generate  # noqa: E402  # it needs the path above
+from docs import figures  # noqa: E402  # it needs the path above
 
 project = "heliotwin"
 html_show_copyright = False
@@ -22,17 +22,12 @@ html_show_sphinx = False
 html_copy_source = False
 html_last_updated_fmt = None
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser"]
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_static"]
 default_role = "literal"
 nitpicky = False
-autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
-napoleon_google_docstring = False
-napoleon_use_ivar = True
 html_math_renderer = "mathml"
 
 
@@ -57,10 +52,6 @@ def _insert_figures(_: Sphinx, __: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Write the generated pages, insert measured figures, and draw equations as MathML.
-
-    MathML needs no script.
-    """
+    """Insert measured figures, and draw equations as MathML, which needs no script."""
     app.connect("source-read", _insert_figures)
-    generate.write_pages(HERE / "reference" / "generated")
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))

@@ -1,12 +1,12 @@
-"""Reference pages that are written from the code: ``python -m docs.generate FOLDER``.
+"""Reference pages that are written from the code: ``python -m docs.generate``.
 
-The build of the site writes them each time, so they always describe the current code.
+They are committed, so that links to them work in a clone and the guide is built without the
+product. A test compares them with the code.
 """
 
 import dataclasses
 import inspect
 import re
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -18,6 +18,7 @@ import click
 from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
+from docs.python_api import python_api_page
 from model.effects import CATALOGUE
 from service.base import settings as settings_module
 from service.base.settings import Settings
@@ -29,6 +30,7 @@ from service.web.app import create_app
 from service.web.auth.security import Role
 from service.web.store_metrics import registry
 
+FOLDER = Path(__file__).parent / "reference" / "generated"
 Pages = dict[str, Callable[[], str]]
 METHODS = ("get", "post", "put", "patch", "delete")
 
@@ -377,10 +379,11 @@ PAGES: Pages = {
     "effects": effects_page,
     "roles": roles_page,
     "plant-schema": plant_schema_page,
+    "python-api": partial(python_api_page, _prose),
     **{name: partial(notebook_page, name) for name in NOTEBOOKS},
 }
 """Name of each page, and the function that writes it."""
 
 
 if __name__ == "__main__":
-    write_pages(Path(sys.argv[1]))
+    write_pages(FOLDER)

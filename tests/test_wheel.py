@@ -20,9 +20,12 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import heliotwin as heliotwin_package
 from tests.docker.engine import clone
 from tests.service.conftest import free_port
 from tests.waiting import WAIT_LIMIT_S, child_process, until
+
+pytestmark = pytest.mark.full
 
 
 def _bare() -> dict[str, str]:
@@ -154,6 +157,15 @@ def test_library(python: Path, made_plant: Path, tmp_path: Path):
     )
     said = _run(python, "-c", code % str(made_plant), folder=tmp_path)
     assert said.strip() == "(256, 256)"
+    said = _run(python, "-c", "import heliotwin; print(heliotwin.__version__)", folder=tmp_path)
+    assert said.strip() == heliotwin_package.__version__
+    assert heliotwin(python, tmp_path, "--version").strip() == f"heliotwin {said.strip()}"
+
+
+def test_demonstration(python: Path, pair_plant: Path, tmp_path: Path):
+    done = report(python, tmp_path, "demo", "--data", pair_plant, "--out", "demo")
+    assert len(done["heliostats"]) == 2
+    assert "<html" in (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
 
 
 def test_service(python: Path, tmp_path: Path):
@@ -179,6 +191,11 @@ def test_service(python: Path, tmp_path: Path):
         assert httpx.get(f"http://127.0.0.1:{port}/readyz").json()["status"] == "ok"
         for path in ("/", "/openapi.json"):
             assert httpx.get(f"http://127.0.0.1:{port}{path}").status_code == 200
+        assert '<a href="/docs/guide">Guide</a>' in httpx.get(f"http://127.0.0.1:{port}/").text
+        guide = httpx.get(f"http://127.0.0.1:{port}/docs/guide", follow_redirects=True)
+        for page in ("", "how-to/operator/alarms.html", "reference/generated/settings.html"):
+            answer = httpx.get(guide.url.join(page))
+            assert (answer.status_code, "<h1" in answer.text) == (200, True), page
         process.terminate()
         assert process.wait(WAIT_LIMIT_S) in (0, -15)
     assert "Traceback" not in (tmp_path / "log").read_text(encoding="utf-8")

@@ -20,10 +20,12 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
+from alembic.script import ScriptDirectory
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from service.base.settings import Settings
+from service.store.database import alembic_config
 from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.alarms.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
@@ -343,16 +345,16 @@ def _locked(name: str) -> dict[str, tuple[str, int]]:
     }
 
 
-def _needed() -> set[str]:
-    """What is installed here because heliotwin needs it, at any remove, without extras that nobody
-    asked for.
-    """
+def _needed(*extras: str) -> set[str]:
+    """What is installed here because heliotwin with these extras needs it, at any remove."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    asked, found = [(Requirement(text), {""}) for text in project["dependencies"]], set[str]()
+    lines = [*project["dependencies"]]
+    lines += [line for extra in extras for line in project["optional-dependencies"][extra]]
+    asked, found = [(Requirement(text), {""}) for text in lines], set[str]()
     while asked:
-        requirement, extras = asked.pop()
+        requirement, given = asked.pop()
         marker, name = requirement.marker, canonicalize_name(requirement.name)
-        if marker is not None and not any(marker.evaluate({"extra": extra}) for extra in extras):
+        if marker is not None and not any(marker.evaluate({"extra": extra}) for extra in given):
             continue
         if name not in found or requirement.extras:
             found.add(name)
@@ -373,26 +375,30 @@ def test_locks_hold_what_the_service_needs_in_the_versions_of_the_constraints():
         for line in lines
         if "==" in line
     }
-    everywhere, cpu, gpu = (_locked(f"requirements{kind}.lock") for kind in ("", "-cpu", "-gpu"))
+    everywhere, cpu, gpu, docs = (
+        _locked(f"requirements{kind}.lock") for kind in ("", "-cpu", "-gpu", "-docs")
+    )
     assert set(everywhere) | set(cpu) == _needed()
-    for name, (version, _) in (everywhere | gpu).items():
+    for name, (version, _) in (everywhere | gpu | docs).items():
         assert version == constrained.get(name, version), name
     assert set(everywhere) - set(constrained) == {"setuptools"}  # which pip freeze leaves out
     assert {name: version for name, (version, _) in cpu.items()} == {
         "torch": f"{constrained['torch']}+cpu"
     }
     assert {"torch", "nvidia-cudnn-cu13", "triton"} <= set(gpu)
-    assert not set(everywhere) & (set(cpu) | set(gpu))
-    assert all(hashes >= 1 for lock in (everywhere, cpu, gpu) for _, hashes in lock.values())
+    assert not set(everywhere) & (set(cpu) | set(gpu) | set(docs))
+    assert set(everywhere) | set(cpu) | set(docs) == _needed("docs")
+    assert all(hashes >= 1 for lock in (everywhere, cpu, gpu, docs) for _, hashes in lock.values())
 
 
 def test_nothing_is_installed_but_by_its_hash(dockerfile: list[tuple[str, str]]):
     text = " ".join(arguments for name, arguments in dockerfile if name == "RUN")
-    by_hash, *others = re.findall(r"pip (?:install|wheel) ([^&]*)", text)
-    assert by_hash.startswith("--no-deps --require-hashes ")
-    assert re.findall(r'-r "?([^ "]+)', by_hash) == [
+    runtime, docs, *others = re.findall(r"pip (?:install|wheel) ([^&]*?)(?= /opt|&|$)", text)
+    assert all(words.startswith("--no-deps --require-hashes ") for words in (runtime, docs))
+    assert re.findall(r'-r "?([^ "]+)', f"{runtime} {docs}") == [
         "requirements.lock",
         "requirements-${torch:-gpu}.lock",
+        "requirements-docs.lock",
     ]
     assert len(others) == 2
     assert all("--no-index" in words and "--no-deps" in words for words in others)
@@ -523,5 +529,6 @@ def test_installed_copy_brings_migrations_and_weights(
         command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
     )
     revision, weights = done.stdout.split()
-    assert revision.isdigit()
+    assert revision == ScriptDirectory.from_config(alembic_config()).get_current_head()
+    assert (installed / "service" / "web" / "root" / "guide" / "index.html").is_file()
     assert weights.startswith("surface-network-")

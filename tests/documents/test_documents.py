@@ -2,10 +2,14 @@
 
 import hashlib
 import re
+import subprocess
+from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
+from docs.backend import GUIDE
+from docs.generate import FOLDER, write_pages
 from service.base.settings import Settings
 from service.cli.main import app
 from service.twin.alarms.reasons import REASONS
@@ -42,12 +46,37 @@ def test_sentences_are_counted_as_a_reader_counts_them():
     assert sentences(text) == ["One link is here.", "Two; three code.", "item one"]
 
 
-def test_links_of_the_readme_lead_to_files():
-    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", README.read_text(encoding="utf-8"))
-    files = [target for target in targets if "://" not in target]
-    assert len(files) > 10
-    missing = [target for target in files if not (ROOT / target).exists()]
+def test_links_lead_to_files_of_a_clone():
+    """Of every page at the top and in the guide, so that a forge shows what they lead to."""
+    known = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
+    files = {(ROOT / name).resolve() for name in known}
+    links = [
+        (page, target)
+        for page in [*ROOT.glob("*.md"), *DOCS.rglob("*.md")]
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8"))
+        if "://" not in target
+    ]
+    assert len(links) > 100
+    missing = [(page, to) for page, to in links if (page.parent / to).resolve() not in files]
     assert not missing
+
+
+def test_pages_from_the_code_are_current(tmp_path: Path):
+    write_pages(tmp_path)
+    stale = [
+        page.name
+        for page in {*tmp_path.iterdir(), *FOLDER.iterdir()}
+        if not (FOLDER / page.name).is_file()
+        or not (tmp_path / page.name).is_file()
+        or (FOLDER / page.name).read_bytes() != (tmp_path / page.name).read_bytes()
+    ]
+    assert not stale, "python -m docs.generate writes them"
 
 
 def test_every_alarm_has_its_section_with_meaning_cause_and_action():
@@ -83,7 +112,7 @@ def test_settings_verbs_and_files_that_pages_name_exist():
 
 def test_anchors_of_alarms_are_those_of_the_built_page():
     """Sphinx writes hyphens in them; the template of the alarms replaces them likewise."""
-    built = ROOT / "build" / "docs" / "how-to" / "operator" / "alarms.html"
+    built = GUIDE / "how-to" / "operator" / "alarms.html"
     if not built.exists():
         pytest.skip("the guide is not built: make docs")
     page = built.read_text(encoding="utf-8")

@@ -53,7 +53,7 @@ _NOTICE = {
 
 
 GUIDE = Path(__file__).resolve().parents[1] / "root" / "guide"
-"""The built guide; ``make docs`` puts it here."""
+"""The built guide; an installation puts it here."""
 
 
 def has_guide() -> bool:

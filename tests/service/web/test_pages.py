@@ -315,7 +315,7 @@ def test_forecast_form_says_what_is_wrong(shown: TestClient, changes: dict[str, 
     assert said in answer.text
     assert "<h1" in answer.text
     part = shown.post("/forecast", data=form(**changes), headers=HTMX)
-    assert part.text.startswith('<p class="alarm" role="alarm">')
+    assert part.text.startswith('<p class="alert" role="alert">')
     assert part.headers["HX-Retarget"] == "#notice"
 
 
