@@ -41,6 +41,7 @@ OF_ONE_WORKER = (
     "tests/test_additions.py",
     "tests/model/test_refinement.py",
     "tests/docker/test_client.py",
+    "tests/service/web/test_page_texts.py",
 )
 """Files and folders whose tests share what is expensive to make: an image, a browser, an
 environment, a surface. The longest come first, and they come before all others.

@@ -66,6 +66,45 @@ class Element:
         return self.attributes.get(name) == value
 
 
+_INLINE = frozenset(
+    ["a", "b", "code", "em", "i", "kbd", "label", "option", "small", "span", "strong"]
+    + ["sub", "sup", "td", "th", "time"]
+)
+_UNSEEN = frozenset(["script", "style", "template"])
+_CONTROLS = frozenset(["button", "input", "meter", "progress", "select", "textarea"])
+_STATES = ("checked", "selected", "disabled", "required", "open", "hidden")
+
+
+def lines_of(element: Element) -> list[str]:
+    """What an element shows, a line for each block and row; links and controls in brackets."""
+    lines = [""]
+    for one in element.content:
+        if isinstance(one, str):
+            lines[-1] += re.sub(r"[ \t\n]+", " ", one)
+        elif one.tag in ("svg", "img", "canvas"):
+            label = one.attributes.get("aria-label") or one.attributes.get("alt", "")
+            lines[-1] += f"[{one.tag} {label}]"
+        elif one.tag not in _UNSEEN:
+            first, *more = lines_of(one)
+            if one.tag in _INLINE | _CONTROLS:
+                lines[-1] += first + _brackets(one) + (" | " if one.tag in ("td", "th") else "")
+                lines += more
+            else:
+                lines += [_brackets(one) + first, *more, ""]
+    return [line for line in map(str.rstrip, lines[:-1]) if line.strip()] + lines[-1:]
+
+
+def _brackets(one: Element) -> str:
+    """A link's address; a control's kind, name, value and state."""
+    if one.tag == "a":
+        return f"[{one.attributes.get('href', '')}]"
+    states = [name for name in _STATES if name in one.attributes]
+    if one.tag in _CONTROLS | {"option", "form"}:
+        given = (one.attributes.get(name, "") for name in ("type", "action", "name", "value"))
+        return f"[{' '.join([one.tag, *filter(None, given), *states])}]"
+    return f"[{' '.join(states)}]" if states else ""
+
+
 class Page(str):
     """The markup of a page, and its elements."""
 

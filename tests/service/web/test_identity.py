@@ -451,9 +451,6 @@ def test_accuracy_is_computed_again_after_a_deletion(client: TestClient):
 def test_page_deletes_a_photograph_after_it_is_confirmed(client: TestClient):
     poster(client)(id="1")
     path = "/heliostats/AA39/photographs/1"
-    page = client.get(path, headers=HTML).text
-    assert "<summary>Delete photograph</summary>" in page
-    assert "it cannot be undone" in page
     unconfirmed = client.post(
         f"{path}/delete", data={"reason": "wrong"}, headers=HTML, follow_redirects=False
     )

@@ -219,24 +219,10 @@ def test_heliostat_without_anything_is_drawn_hollow(pages: TestClient, propertie
     assert "No surface yet" in text_of(pages, "/heliostats/AB01")
 
 
-def test_heliostat_page_has_all_its_sections(shown: TestClient):
-    page = text_of(shown, "/heliostats/AA39")
-    for heading in ("Surface 2", "Measured against forecast", "History", "Photographs"):
-        assert heading in page
-    assert page.count('alt="measured flux of') == 2
-    assert "refused</span> no spot" in page
-    assert "100.0\N{NO-BREAK SPACE}%" in page
-    assert 'data-surface="{' in page
-    assert ", not active" in text_of(shown, "/heliostats/AA39?version=1")
-    assert shown.get("/heliostats/AA39?version=9").status_code == 404
-
-
 def test_forecast_form_leads_to_its_flux_map(pages: TestClient, operations: FakeOperations):
     answer = pages.post("/forecast", data=form(), follow_redirects=False)
     assert (answer.status_code, answer.headers["Location"]) == (303, "/forecasts/2")
-    page = text_of(pages, "/forecasts/2")
-    assert "AA39 on lower" in page
-    assert "0.002\N{NO-BREAK SPACE}kW/m²" in page
+    assert "0.002\N{NO-BREAK SPACE}kW/m²" in text_of(pages, "/forecasts/2")
     assert operations.forecasts[-1]["heliostat"] == "AA39"
 
 
@@ -333,29 +319,10 @@ def test_forecast_of_all_heliostats_shows_its_light(app: FastAPI, pages: TestCli
     path = pages.post("/forecast", data=asked, follow_redirects=False).headers["Location"]
     work(app)
     page = text_of(pages, path)
-    for text in (
-        "Power on lower",
-        "Reflected by the mirrors",
-        "62.5° high",
-        "Flux of 1 heliostats together",
-    ):
-        assert text in page
+    assert "62.5° high" in page
+    assert "sunat 2026-06-21 11:36 UTC" in page.words
     assert 'href="data:image/png' in page
-    (about,) = [one for one in page.all("details") if one.all("summary")[0].words == "Request"]
-    terms, values = ([one.words for one in about.all(tag)] for tag in ("dt", "dd"))
-    request = dict(zip(terms, values, strict=True))
-    assert request == {
-        "target": "lower",
-        "mirrors shade and block each other": "yes",
-        "direct normal irradiance": "900\N{NO-BREAK SPACE}W/m²",
-        "resolution": "256 × 256 pixels",
-        "sun": "at 2026-06-21 11:36 UTC",
-        "surface": "current",
-    }
     assert "{" not in page.partition("<main")[2]  # nothing as Python writes it
-    listed = text_of(pages, "/forecast")
-    assert f'<a href="{path}">job' in listed
-    assert "1 together" in listed
     again = text_of(pages, f"/forecast?job={path.rpartition('/')[2]}")
     assert (field_of(again, "heliostat"), field_of(again, "dni_w_m2")) == ("", "900")
     assert field_of(again, "moment") == "2026-06-21 11:36"
@@ -381,7 +348,6 @@ def test_jobs_are_requested_followed_and_cancelled(pages: TestClient):
 
 
 def test_report_of_a_study_is_a_page_that_runs_nothing(shown: TestClient):
-    assert '<a class="button" href="/studies/1/report">' in text_of(shown, "/studies/1")
     report = shown.get("/studies/1/report")
     assert "<p>found</p>" in report.text
     assert '<a href="/studies/1">1</a>' in report.text
@@ -394,11 +360,7 @@ def test_report_of_a_study_is_a_page_that_runs_nothing(shown: TestClient):
 
 def test_study_is_adopted_and_withdrawn(app: FastAPI, pages: TestClient):
     number = keep_study(app, SLOPE)
-    assert "Adopt slope error" in text_of(pages, f"/studies/{number}")
     assert pages.post(f"/studies/{number}/adopt", follow_redirects=False).status_code == 303
-    page = text_of(pages, f"/studies/{number}")
-    assert "Adopted as version 2" in page
-    assert "Withdraw it" in page
     assert "version <strong>2</strong>: slope error" in text_of(pages, "/studies")
     assert pages.post(f"/studies/{number}/withdraw", follow_redirects=False).status_code == 303
     assert "version <strong>1</strong>: the declared model" in text_of(pages, "/studies")

@@ -192,22 +192,12 @@ def test_form_leads_to_the_plan_which_can_be_reopened(app: FastAPI, two_heliosta
     assert 'hx-trigger="every 2s"' in text_of(two_heliostats, path)
     work(app)
     page = text_of(two_heliostats, path)
-    for phrase in (
-        "Plan June",
-        "at 4 of 4 times",
-        "Intercept",
-        "Spillage",
-        "Through the day",
-        "outlined",
-    ):
-        assert phrase in page
     assert "hx-trigger" not in page.partition("<main")[2]
     assert page.count('class="limit"') == 1
     # The form holds what was asked, and the list leads back.
     assert "AA39 0.5 -1\nAB01</textarea>" in page
     assert field_of(page, "allowed_kw_m2") == "0.0015"
     assert 'value="2026-06-21 02:00"' in page
-    assert f'<a href="{path}">June</a>' in text_of(two_heliostats, "/plans")
     assert "2026-06-21 06:00 UTC</time></h2>" in text_of(two_heliostats, f"{path}?at=1")
     assert "2026-06-21 10:00 UTC</time></h2>" in text_of(two_heliostats, f"{path}?at=99")
     assert f'href="{path}">Open plan “June”</a>' in text_of(

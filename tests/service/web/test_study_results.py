@@ -37,11 +37,8 @@ def studied(undeclared: Path, tmp_path: Path) -> Iterator[Studied]:
 
 def test_an_effect_of_the_light_and_what_its_adoption_would_change(studied: Studied):
     client = studied(1, "slope_error")
-    page = text_of(client, "/studies/1")
-    assert "effect found" in page
-    assert "Adopt slope error" in page
-    assert not page.all("input", name="read")  # nothing is open, so nothing must be confirmed
-    assert "Reason (optional)" in page
+    # Nothing is open, so nothing must be confirmed.
+    assert not text_of(client, "/studies/1").all("input", name="read")
     change = text_of(client, "/studies/1/change")
     assert "The flux stays the same" not in change
     sheet = client.get("/studies/1/change?table=changes").text
@@ -60,9 +57,6 @@ def test_an_effect_of_the_light_and_what_its_adoption_would_change(studied: Stud
 
 def test_nothing_missing_and_not_explained_have_nothing_to_adopt(studied: Studied):
     client = studied(2, "slope_error")
-    page = text_of(client, "/studies/1")
-    assert "nothing missing" in page
-    assert "there is nothing to adopt" in page
     for path in ("/studies/1", "/studies"):
         assert not text_of(client, path).all("form", action="/studies/1/adopt")
     assert "changes nothing" in client.get("/studies/1/change").json()["detail"]
@@ -70,9 +64,6 @@ def test_nothing_missing_and_not_explained_have_nothing_to_adopt(studied: Studie
 
 def test_not_explained(studied: Studied):
     client = studied(3, "sun_shape")
-    page = text_of(client, "/studies/1")
-    assert "not explained" in page
-    assert "there is nothing to adopt" in page
     assert client.get("/v1/studies/1").json()["state"] == "nothing_to_adopt"
 
 
