@@ -180,7 +180,8 @@ def test_page_shows(filled: TestClient, path: str, snapshot: SnapshotAssertion):
 
 
 def test_navigation(filled: TestClient, snapshot: SnapshotAssertion):
-    assert "\n".join(lines_of(Page(filled.get("/").text).one("header"))) == snapshot
+    lines = lines_of(Page(filled.get("/").text).one("header"))
+    assert [line for line in lines if "/docs/guide" not in line] == snapshot  # if it is built
 
 
 def test_forms_repeat_what_was_given_and_say_what_is_wrong(
