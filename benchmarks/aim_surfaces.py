@@ -111,7 +111,8 @@ def main() -> None:
         kernels: Kernels = getattr(found, row)
         plan = plan_aims(kernels, limit)
         judged = replace(judged_on(plan, true), limit=limit)
-        said = plan_uncertainty(plan, found.drawn if row == "twin" else ())
+        drawn = [lambda one=one: one for one in found.drawn] if row == "twin" else []
+        said = plan_uncertainty(plan, drawn)
         moment = plan_uncertainty(judged)
         cells = {
             "power, less than said [%]": 100 * (1 - judged.power / plan.power),

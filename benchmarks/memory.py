@@ -288,6 +288,29 @@ def plan(times: int, resolution: int, heliostats: int) -> Send:
     )
 
 
+def aims(heliostats: int, side: int, times: int = 1, steps: int = 1) -> Send:
+    """So many plans of aims at the same time, on square maps, each for another limit."""
+
+    def send(http: httpx.Client) -> str:
+        def plan(number: int) -> str:
+            minutes = {"first": "12:00", "last": f"12:{steps - 1:02d}", "step_minutes": 1}
+            return job(
+                "aim-plans",
+                ("/v1/jobs/{}/flux", "/jobs/{}"),
+                target=TARGET,
+                heliostats=[f"H{number:05d}" for number in range(heliostats)],
+                resolution=[side, side],
+                day={"date": "2026-06-21"} | minutes,
+                limit_w_m2=(5 + number) * 1e3 * heliostats,
+                neighbours=False,
+            )(http)
+
+        with ThreadPoolExecutor(times) as pool:
+            return "; ".join(pool.map(plan, range(times)))
+
+    return send
+
+
 def imported(root: Path, make: Callable[[Path], None]) -> Send:
     """An import of a folder that holds one heliostat and a bad file."""
 
@@ -416,6 +439,10 @@ def inputs(root: Path) -> dict[str, Send]:
         "field forecast, 20,000 mirrors, 1024 x 1024": job(
             "forecasts", ("/v1/jobs/{}/flux", "/jobs/{}"), target=TARGET, **own
         ),
+        "aims of 2,650 heliostats, 1024 x 1024": aims(2650, 1024),
+        "aims of 2,650 heliostats, 137 x 137": aims(2650, 137),
+        "aims of 20,000 heliostats, 50 x 50": aims(20_000, 50),
+        "aims of 47 heliostats, 1024 x 1024, twice": aims(47, 1024, times=2, steps=2),
         "import of an npz of 5.8 MB": imported(root, npz_bomb),
         "import of an h5 of declared 10^10 points": imported(root, h5_bomb),
         "import of an h5 of 4 x 500,000 points": imported(root, largest_h5),

@@ -23,7 +23,9 @@ from model.aiming.plan import AimPlan, mirror_values
 _GRID = 2 * SIZE
 """Places along each side of the grid of aims: twice the image, so that nothing wraps around."""
 
-_CHUNK = 256
+_MIRRORS = 256
+"""Mirrors whose aims are sought at once."""
+
 _STEPS = 6
 _STEP = 0.05
 
@@ -85,10 +87,7 @@ def _best_aims(plan: AimPlan, multipliers: Tensor) -> _Best:
     """Best aims of the grid, or the plan's own where they are better."""
     kernels = plan.kernels
     weights = (1 - multipliers) * kernels.areas
-    parts = [
-        _best_of(kernels.subset(range(start, min(start + _CHUNK, len(kernels)))), weights)
-        for start in range(0, len(kernels), _CHUNK)
-    ]
+    parts = [_best_of(part, weights) for part, _ in kernels.parts(_MIRRORS)]
     moved, values = (torch.cat([getattr(p, name) for p in parts]) for name in ("moved", "values"))
     own = mirror_values(replace(plan, multipliers=multipliers))
     is_better = own > values
@@ -100,7 +99,7 @@ def _best_aims(plan: AimPlan, multipliers: Tensor) -> _Best:
 def _best_of(kernels: Kernels, weights: Tensor) -> _Best:
     """Best aims of some mirrors for what light is worth in each pixel (P,) [m2]."""
     pixel = kernels.sides / SIZE
-    worth = _on_planes(kernels, weights, pixel)
+    worth = _on_planes(kernels, weights)
     images = torch.zeros_like(worth)
     images[:, :SIZE, :SIZE] = kernels.expected
     spectrum = torch.fft.rfft2(worth) * torch.fft.rfft2(images).conj()
@@ -131,14 +130,14 @@ def _beyond(values: Tensor, row: Tensor, column: Tensor) -> Tensor:
     return above
 
 
-def _on_planes(kernels: Kernels, weights: Tensor, pixel: Tensor) -> Tensor:
+def _on_planes(kernels: Kernels, weights: Tensor) -> Tensor:
     """What light is worth (N, _GRID, _GRID) on the pixels of the mirrors' planes.
 
     It is the adjoint of `Kernels.light`: bilinear shares of each place.
     """
     worth = kernels.factors * weights[kernels.pixels]
-    x = kernels.places[..., 0] / pixel[:, None] + _GRID / 2
-    y = _GRID / 2 - kernels.places[..., 1] / pixel[:, None]
+    x, y = kernels.places.unbind(dim=1)
+    x, y = x * (SIZE / 2) + _GRID / 2, y * (SIZE / 2) + _GRID / 2
     is_inside = (x >= 0) & (x < _GRID - 1) & (y >= 0) & (y < _GRID - 1)
     worth = worth * is_inside
     left, top = (place.floor().clamp(0, _GRID - 2) for place in (x, y))

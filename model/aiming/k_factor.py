@@ -60,7 +60,8 @@ def _without_hottest(plan: AimPlan) -> AimPlan:
     """A plan without those mirrors that put the most light on the hottest pixel."""
     kernels = plan.kernels
     hottest = int((plan.flux / plan.limit).argmax())
-    light = (kernels.light(plan.moved) * (kernels.pixels == hottest)).sum(dim=1)
+    at = kernels.on_pixels(torch.tensor([hottest]))
+    light = at.light(plan.moved).sum(dim=1)
     light[~plan.is_active] = -1.0
     active = plan.is_active.clone()
     active[torch.argsort(light, descending=True)[: max(1, round(_DEFOCUSED * len(light)))]] = False
@@ -85,10 +86,11 @@ def _sectors(kernels: Kernels) -> _Sectors:
 
 def _sectors_that_light(kernels: Kernels, sector: Tensor, pixels: Tensor) -> Tensor:
     """Sectors whose mirrors light pixels (P,) most steeply: (SECTORS,) bool."""
-    facing = kernels.factors * pixels[kernels.pixels]
-    best = facing.max(dim=1).values > _STEEP * kernels.factors.max(dim=1).values
     hot = torch.zeros(SECTORS, dtype=torch.bool)
-    hot[sector[best]] = True
+    for part, rows in kernels.parts():
+        facing = part.factors * pixels[part.pixels]
+        best = facing.max(dim=1).values > _STEEP * part.factors.max(dim=1).values
+        hot[sector[rows][best]] = True
     return hot
 
 

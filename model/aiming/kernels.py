@@ -9,9 +9,8 @@ two aims, some hundredths of a radian, which changes the image far less than its
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,10 +39,38 @@ _CONE_SHARE, _DEVIATIONS = 0.98, 3.0
 
 _PADDING = 0.1
 
+MAX_PAIRS = 50_000_000
+"""Heliostats times pixels of a plan: each pair that has light takes 16 bytes."""
+
+LARGE_PAIRS = 8_000_000
+"""Pairs above which a machine should make one plan at a time."""
+
+_PART = 2**21
+"""Pairs of mirrors and pixels that are computed at once."""
+
+
+def require_few_pairs(heliostats: int, resolution: tuple[int, int]) -> None:
+    """Refuse a map of (rows, columns) that has too many pixels for so many heliostats.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are more than `MAX_PAIRS`; the message names the field and the remedy.
+    """
+    rows, columns = resolution
+    most = MAX_PAIRS // max(heliostats, 1)
+    if rows * columns > most:
+        raise InvalidInputError(
+            f"resolution: {rows} x {columns} pixels for each of {heliostats} heliostats are"
+            f" {rows * columns * heliostats / 1e6:.0f} million; a plan of aims has at most"
+            f" {MAX_PAIRS / 1e6:.0f} million, here {most} pixels; give fewer rows and columns,"
+            " and trace the field with the aims for a finer map"
+        )
+
 
 @dataclass(frozen=True, eq=False)
-class Kernels:
-    """Images of N mirrors about their aims, and the places of a map that each can light.
+class MirrorImages:
+    """Images of N mirrors about their aims.
 
     Attributes
     ----------
@@ -64,16 +91,6 @@ class Kernels:
         Cholesky factors of the covariances of the pointing errors on the planes, right and up.
     power : Tensor (N,) [W]
         Of the beams.
-    places : Tensor (N, M, 2) [m]
-        Where the light of a map's pixel passes the plane, right and up of the image's middle.
-    factors : Tensor (N, M)
-        Irradiance of the pixel, relative to that on the plane.
-    pixels : Tensor (N, M)
-        Indices into the flattened map.
-    areas : Tensor (P,) [m2]
-        Of the map's pixels.
-    resolution : (rows, columns)
-        Of the map, P = rows * columns.
     """
 
     names: tuple[str, ...]
@@ -85,14 +102,57 @@ class Kernels:
     axes: Tensor
     spread: Tensor
     power: Tensor
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @classmethod
+    def join(cls, parts: Sequence["MirrorImages"]) -> "MirrorImages":
+        """The images of several tiles."""
+        names = tuple(name for part in parts for name in part.names)
+        return cls(
+            names, *(torch.cat([getattr(part, one) for part in parts]) for one in _OF_MIRRORS)
+        )
+
+    def on_map(self, receiver: Receiver, resolution: tuple[int, int]) -> "Kernels":
+        """Find the pixels of a receiver's map of (rows, columns) that each mirror can light."""
+        grid = receiver.grid(*resolution)
+        most = max(1, *(int(part.n_lit().max()) for part in _passed(self, receiver, grid)))
+        parts = (part.lit(most) for part in _passed(self, receiver, grid))
+        lit = _filled(parts, len(self), most)
+        areas = torch.tensor(grid.areas.reshape(-1), dtype=torch.float32)
+        images = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Kernels(**images, **lit._asdict(), areas=areas, resolution=resolution)
+
+
+_OF_MIRRORS = tuple(field.name for field in fields(MirrorImages) if field.name != "names")
+
+
+@dataclass(frozen=True, eq=False)
+class Kernels(MirrorImages):
+    """Images of N mirrors about their aims, and the places of a map that each can light.
+
+    Attributes
+    ----------
+    places : Tensor (N, 2, M)
+        Where the light of a map's pixel passes the plane, right and down of the image's middle, in
+        halves of the image's side. All x of a mirror are in one row, which is twice as fast as
+        pairs.
+    factors : Tensor (N, M)
+        Irradiance of the pixel, relative to that on the plane.
+    pixels : Tensor (N, M) of int32
+        Indices into the flattened map.
+    areas : Tensor (P,) [m2]
+        Of the map's pixels.
+    resolution : (rows, columns)
+        Of the map, P = rows * columns.
+    """
+
     places: Tensor
     factors: Tensor
     pixels: Tensor
     areas: Tensor
     resolution: tuple[int, int]
-
-    def __len__(self) -> int:
-        return len(self.names)
 
     def flux(
         self, moved: Tensor, weights: Tensor | None = None, *, is_sharp: bool = False
@@ -101,39 +161,36 @@ class Kernels:
 
         ``weights`` (N,) are 0 for mirrors that are not active. Differentiable.
         """
-        values = self.light(moved, is_sharp=is_sharp)
-        if weights is not None:
-            values = values * weights[:, None]
-        total: Tensor = values.new_zeros(len(self.areas)).index_add(
-            0, self.pixels.flatten(), values.flatten()
-        )
+        total = moved.new_zeros(len(self.areas))
+        for part, rows in self.parts():
+            values = part.light(moved[rows], is_sharp=is_sharp)
+            if weights is not None:
+                values = values * weights[rows, None]
+            total = total.index_add(0, part.pixels.flatten(), values.flatten())
         return total
 
     def light(self, moved: Tensor, *, is_sharp: bool = False) -> Tensor:
         """Irradiance (N, M) [W/m2] of each mirror in the pixels that it can light."""
         images = self.sharp if is_sharp else self.expected
-        grid = self._grid - (moved * self._scale)[:, :, None]
+        scale = 2 / self.sides[:, None]
+        shift = moved * torch.cat([scale, -scale], dim=1)
         seen = grid_sample(
             images[:, None],
-            grid.transpose(1, 2)[:, None],
+            (self.places - shift[:, :, None]).transpose(1, 2)[:, None],
             padding_mode="zeros",
             align_corners=False,
         )
         light: Tensor = seen[:, 0, 0] * self.factors
         return light
 
-    @property
-    def _scale(self) -> Tensor:
-        """What right and up [m] are relative to half of the images, which begin at the top."""
-        scale = 2 / self.sides
-        return torch.stack([scale, -scale], dim=-1)
-
-    @cached_property
-    def _grid(self) -> Tensor:
-        """The places (N, 2, M) in halves of the images; all x of a mirror are in one row, which is
-        twice as fast as pairs.
-        """
-        return (self.places * self._scale[:, None]).transpose(1, 2).contiguous()
+    def parts(self, most: int = _PART) -> "Iterator[tuple[Kernels, slice]]":
+        """At ``most`` so many mirrors at a time, fewer if each lights many pixels, as views."""
+        step = max(1, min(most, _PART // self.pixels.shape[1]))
+        for start in range(0, len(self), step):
+            rows = slice(start, min(start + step, len(self)))
+            names = "names", *_OF_MIRRORS, *_Lit._fields
+            some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+            yield replace(self, **some), rows
 
     def points(self, moved: Tensor) -> Array:
         """Aim points (N, 3) [m] in ENU of ``moved`` (N, 2) [m]."""
@@ -149,11 +206,31 @@ class Kernels:
         mirrors, aims, axes = (a.double().numpy() for a in (self.mirrors, self.aims, self.axes))
         return torch.tensor(_through(points, mirrors, aims, axes)).to(self.aims)
 
-    def subset(self, rows: Sequence[int] | Tensor) -> "Kernels":
-        """Some of the mirrors."""
-        index = torch.as_tensor(rows, dtype=torch.long)
-        kept: dict[str, Any] = {name: getattr(self, name)[index] for name in _OF_MIRRORS}
-        return replace(self, names=tuple(self.names[row] for row in index.tolist()), **kept)
+    def on_pixels(self, kept: Tensor) -> "Kernels":
+        """The same images on pixels ``kept`` (K,) of the map, whose resolution stays."""
+        number = torch.full((len(self.areas),), -1, dtype=torch.int32)
+        number[kept] = torch.arange(len(kept), dtype=torch.int32)
+        most = max(1, *(int(part._is_lit(number).sum(dim=1).max()) for part, _ in self.parts()))
+        parts = (part._numbered(number, most) for part, _ in self.parts())
+        lit = _filled(parts, len(self), most)
+        return replace(self, **lit._asdict(), areas=self.areas[kept])
+
+    def _is_lit(self, number: Tensor) -> Tensor:
+        """Whether mirrors light their pixels (N, M), and these have a new number."""
+        return (number[self.pixels] >= 0) & (self.factors > 0)
+
+    def _numbered(self, number: Tensor, count: int) -> "_Lit":
+        """Of each mirror the lit pixels that have a new number, one after another."""
+        mirror, source = self._is_lit(number).nonzero(as_tuple=True)
+        counts = torch.bincount(mirror, minlength=len(self))
+        place = torch.arange(len(mirror)) - (counts.cumsum(0) - counts)[mirror]
+
+        def chosen(values: Tensor) -> Tensor:
+            some = values.new_zeros(*values.shape[:-1], count)
+            some[mirror, ..., place] = values[mirror, ..., source]
+            return some
+
+        return _Lit(chosen(self.places), chosen(self.factors), chosen(number[self.pixels]))
 
     def thinned(self) -> "Thinned":
         """The same images with one pixel of each two by two, in turn each of the four."""
@@ -165,28 +242,7 @@ class Kernels:
         kept, block = torch.unique(kept_row * columns + kept_column, return_inverse=True)
         block = block.flatten()
         areas = torch.zeros(len(kept)).index_add(0, block, self.areas)
-        number = torch.full((rows * columns,), -1)
-        number[kept] = torch.arange(len(kept))
-        # Of each mirror the pixels that remain and that it lights, one after another.
-        pixels = number[self.pixels]
-        mirror, source = ((pixels >= 0) & (self.factors > 0)).nonzero(as_tuple=True)
-        counts = torch.bincount(mirror, minlength=len(self))
-        place = torch.arange(len(mirror)) - (counts.cumsum(0) - counts)[mirror]
-        count = max(1, int(counts.max()))
-
-        def chosen(values: Tensor) -> Tensor:
-            some = values.new_zeros(len(self), count, *values.shape[2:])
-            some[mirror, place] = values[mirror, source]
-            return some
-
-        kernels = replace(
-            self,
-            places=chosen(self.places),
-            factors=chosen(self.factors),
-            pixels=chosen(pixels),
-            areas=areas,
-        )
-        return Thinned(kernels, block)
+        return Thinned(replace(self.on_pixels(kept), areas=areas), block)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,18 +256,19 @@ class Thinned:
     block: Tensor
 
 
-_OF_PIXELS = ("places", "factors", "pixels")
-_OF_MIRRORS = (
-    *("expected", "sharp", "sides", "aims", "mirrors", "axes", "spread", "power"),
-    *_OF_PIXELS,
-)
+class _Lit(NamedTuple):
+    """What of a map mirrors can light, as of `Kernels`."""
+
+    places: Tensor
+    factors: Tensor
+    pixels: Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class KernelTile:
-    """The kernels of a tile, and why some of its mirrors have none."""
+class ImageTile:
+    """The images of a tile, and why some of its mirrors have none."""
 
-    kernels: Kernels | None
+    images: list[MirrorImages]
     skipped: dict[str, str]
 
 
@@ -224,33 +281,33 @@ class _Images(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class KernelTracer:
+class ImageTracer:
     """The task of each tile; calling it with a tile traces the images of its mirrors.
 
     Attributes
     ----------
     field : Superposition
-        What is traced; its resolution is that of the map.
+        What is traced; its resolution does not matter.
     """
 
     field: Superposition
 
-    def __call__(self, tile: Tile) -> KernelTile:
+    def __call__(self, tile: Tile) -> ImageTile:
         """Trace the mirrors of a tile, and skip those that cannot reach the receiver."""
-        found: list[Kernels] = []
+        found: list[MirrorImages] = []
         skipped: dict[str, str] = {}
         for part, made in in_parts(self._trace, tile):
             if isinstance(made, ModelError):
                 skipped[part.setups[0].heliostat.name] = str(made)
             else:
                 found += made
-        return KernelTile(join(found) if found else None, skipped)
+        return ImageTile(found, skipped)
 
-    def _trace(self, tile: Tile) -> list[Kernels]:
+    def _trace(self, tile: Tile) -> list[MirrorImages]:
         with torch.no_grad():
-            return [self._kernels(*lit) for lit in self.field.scenes(tile)]
+            return [self._images(*lit) for lit in self.field.scenes(tile)]
 
-    def _kernels(self, setups: Sequence[Setup], scene: Scene, optics: Optics) -> Kernels:
+    def _images(self, setups: Sequence[Setup], scene: Scene, optics: Optics) -> MirrorImages:
         self.field.between()
         receiver = self.field.receiver
         mirrors = scene.center.double().numpy()
@@ -265,9 +322,8 @@ class KernelTracer:
         rays = central_rays(scene, self.field.samples)
         images = _images(rays, torch.tensor(middles).to(scene.sun), scene, optics, max(planes.size))
         aims = planes.centers + np.einsum("bi,bij->bj", middles, planes.axes[:, :2])
-        lit = _lit(receiver, self.field.resolution, mirrors, planes, aims)
         single = torch.float32
-        return Kernels(
+        return MirrorImages(
             names=tuple(setup.heliostat.name for setup in setups),
             expected=images.expected.to(single),
             sharp=images.sharp.to(single),
@@ -277,11 +333,6 @@ class KernelTracer:
             axes=torch.tensor(planes.axes, dtype=single),
             spread=_spread(rays, optics).to(single),
             power=(rays.power.sum(-1) * irradiance_of(scene, optics, rays.slant_range)).to(single),
-            places=torch.tensor(lit.places, dtype=single),
-            factors=torch.tensor(lit.factors, dtype=single),
-            pixels=torch.tensor(lit.pixels),
-            areas=torch.tensor(lit.areas, dtype=single),
-            resolution=self.field.resolution,
         )
 
 
@@ -350,72 +401,75 @@ def _spread(rays: Rays, optics: Optics) -> Tensor:
     return factor
 
 
-class _Lit(NamedTuple):
-    """What of a map each mirror can light: as of `Kernels`."""
+class _Passed(NamedTuple):
+    """Where light of a few mirrors to all pixels passes their planes.
+
+    Attributes
+    ----------
+    places : (B, 2, P)
+        Right and down of the images' middles, in halves of their sides.
+    factors : (B, P)
+        As of `Kernels`.
+    """
 
     places: Array
     factors: Array
-    pixels: NDArray[np.int64]
-    areas: Array
+
+    def n_lit(self) -> NDArray[np.int64]:
+        """Number of pixels (B,) that each mirror lights."""
+        return np.asarray((self.factors > 0).sum(axis=1))
+
+    def lit(self, count: int) -> _Lit:
+        """Those pixels, before others that a mirror does not light, ``count`` of each mirror."""
+        chosen = np.argsort(self.factors <= 0, axis=1, kind="stable")[:, :count]
+        places = np.take_along_axis(self.places, chosen[:, None], axis=2)
+        factors = np.take_along_axis(self.factors, chosen, axis=1)
+        return _Lit(*(torch.tensor(one) for one in (places, factors, chosen)))
 
 
-def _lit(
-    receiver: Receiver,
-    resolution: tuple[int, int],
-    mirrors: Array,
-    planes: TouchingPlanes,
-    aims: Array,
-) -> _Lit:
-    """Pixels that mirrors (B, 3) can light through planes, relative to ``aims`` (B, 3) [m]."""
-    grid = receiver.grid(*resolution)
-    passed = passages(
-        *(torch.tensor(a) for a in (mirrors, aims, planes.axes, grid.points, grid.normals))
+def _passed(images: MirrorImages, receiver: Receiver, grid: SurfaceGrid) -> Iterator[_Passed]:
+    """Follow light from a few mirrors at a time to all pixels."""
+    step = max(1, _PART // (8 * grid.areas.size))
+    axes, mirrors, aims, sides = (
+        getattr(images, name).double().numpy() for name in ("axes", "mirrors", "aims", "sides")
     )
-    places = torch.stack([passed.right, passed.up], dim=-1).flatten(1, 2).numpy()
-    factors = passed.gain.flatten(1).numpy()
-    factors = factors * _open(planes, places, aims, mirrors, grid)
-    count = max(1, int((factors > 0).sum(axis=1).max()))
-    # The pixels that a mirror lights, before those that it does not.
-    chosen = np.argsort(factors <= 0, axis=1, kind="stable")[:, :count]
-    return _Lit(
-        np.take_along_axis(places, chosen[..., None], axis=1),
-        np.take_along_axis(factors, chosen, axis=1),
-        chosen,
-        grid.areas.reshape(-1),
+    for start in range(0, len(images), step):
+        rows = slice(start, start + step)
+        planes = replace(receiver.touching(mirrors[rows]), axes=axes[rows])
+        given = (mirrors[rows], aims[rows], axes[rows], grid.points, grid.normals)
+        passed = passages(*(torch.tensor(one) for one in given))
+        places = torch.stack([passed.right, passed.up], dim=1).flatten(2).numpy()
+        factors = passed.gain.flatten(1).numpy()
+        factors = factors * _open(planes, places, aims[rows], mirrors[rows], grid)
+        yield _Passed(places * (2 / sides[rows, None, None] * [[1], [-1]]), factors)
+
+
+def _filled(parts: Iterable[_Lit], mirrors: int, count: int) -> _Lit:
+    """Join the pixels of a few mirrors at a time, ``count`` of each mirror, in single precision."""
+    whole = _Lit(
+        torch.zeros(mirrors, 2, count),
+        torch.zeros(mirrors, count),
+        torch.zeros(mirrors, count, dtype=torch.int32),
     )
+    start = 0
+    for part in parts:
+        rows = slice(start, start + len(part.pixels))
+        for values, of_part in zip(whole, part, strict=True):
+            values[rows] = of_part
+        start = rows.stop
+    return whole
 
 
 def _open(
     planes: TouchingPlanes, places: Array, aims: Array, mirrors: Array, grid: SurfaceGrid
 ) -> Array:
     """Share (B, P) of light that passes an aperture and no screen hides."""
-    share = np.ones(places.shape[:2])
+    share = np.ones((len(places), places.shape[-1]))
     if planes.outline is not None:
-        origin = np.einsum("bij,bj->bi", planes.axes, aims - planes.centers)[:, None, :2]
-        x, y = np.moveaxis(places + origin, -1, 0)
+        origin = np.einsum("bij,bj->bi", planes.axes, aims - planes.centers)[:, :2, None]
+        x, y = np.moveaxis(places + origin, 1, 0)
         share *= inside_outline(x, y, planes.outline)
     if planes.screens is not None:
         seen = in_sight(planes.screens, torch.tensor(mirrors), grid)
         share *= seen.double().numpy().reshape(share.shape)
     return share
-
-
-def join(parts: Iterable[Kernels]) -> Kernels:
-    """The kernels of several tiles on one map."""
-    some = list(parts)
-    count = max(one.pixels.shape[1] for one in some)
-
-    def joined(name: str) -> Tensor:
-        tensors = [getattr(one, name) for one in some]
-        if name in _OF_PIXELS:
-            tensors = [_filled(tensor, count) for tensor in tensors]
-        return torch.cat(tensors)
-
-    every: dict[str, Any] = {name: joined(name) for name in _OF_MIRRORS}
-    return replace(some[0], names=tuple(n for one in some for n in one.names), **every)
-
-
-def _filled(tensor: Tensor, count: int) -> Tensor:
-    """A tensor (N, m, ...) with zeros up to (N, count, ...)."""
-    missing = tensor.new_zeros(len(tensor), count - tensor.shape[1], *tensor.shape[2:])
-    return torch.cat([tensor, missing], dim=1)

@@ -359,17 +359,34 @@ def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:
     """Draw the errors of `AimPlan.draws`, with flux that changes in proportion to them."""
     kernels, flux = plan.kernels, plan.flux
     errors = _errors(kernels, count, 0)
-    drawn, variance = torch.zeros(count, len(flux)), torch.zeros_like(flux)
-    with torch.no_grad():
+    variance, ratios = [], torch.full((count,), -math.inf)
+    bands = math.ceil(len(kernels) * len(flux) / _DENSE)
+    for band in torch.arange(len(flux)).chunk(bands):
+        some = kernels if len(band) == len(flux) else kernels.on_pixels(band)
+        drawn, of_band = torch.zeros(count, len(band)), torch.zeros(len(band))
         for axis in range(2):
-            shift = kernels.spread[:, :, axis] / 2
-            change = kernels.light(plan.moved + shift) - kernels.light(plan.moved - shift)
-            change = change * plan.is_active[:, None]
-            variance.index_add_(0, kernels.pixels.flatten(), (change**2).flatten())
-            dense = torch.zeros(len(kernels), len(flux)).scatter_add_(1, kernels.pixels, change)
-            drawn += errors[:, :, axis] @ dense
-    ratios = ((flux + drawn) / plan.limit).max(dim=1).values
-    return LinearDraws(variance.sqrt(), ratios.double().numpy())
+            drawn += errors[:, :, axis] @ _changes(replace(plan, kernels=some), axis, of_band)
+        ratio = drawn.add_(flux[band]).div_(plan.limit[band]).max(dim=1).values
+        ratios = torch.maximum(ratios, ratio)
+        variance.append(of_band)
+    return LinearDraws(torch.cat(variance).sqrt(), ratios.double().numpy())
+
+
+_DENSE = 2**25
+"""Mirrors times pixels of a map whose changes are in memory at once."""
+
+
+def _changes(plan: AimPlan, axis: int, variance: Tensor) -> Tensor:
+    """What a standard deviation of the errors changes (N, P) [W/m2]; ``variance`` grows by it."""
+    changes = torch.zeros(len(plan.kernels), len(variance))
+    with torch.no_grad():
+        for part, rows in plan.kernels.parts():
+            moved, shift = plan.moved[rows], part.spread[:, :, axis] / 2
+            change = part.light(moved + shift) - part.light(moved - shift)
+            change *= plan.is_active[rows, None]
+            variance.index_add_(0, part.pixels.flatten(), (change**2).flatten())
+            changes[rows].scatter_add_(1, part.pixels.long(), change)
+    return changes
 
 
 def _errors(kernels: Kernels, count: int, seed: int) -> Tensor:
@@ -390,7 +407,10 @@ def _defocused(plan: AimPlan, excess: float) -> AimPlan:
 
 def mirror_values(plan: AimPlan) -> Tensor:
     """Power (N,) [W] of each mirror, less what its light costs at the multipliers."""
-    kernels = plan.kernels
-    weights = ((1 - plan.multipliers) * kernels.areas)[kernels.pixels]
+    worth = (1 - plan.multipliers) * plan.kernels.areas
     with torch.no_grad():
-        return (kernels.light(plan.moved) * weights).sum(dim=1)
+        values = [
+            (part.light(plan.moved[rows]) * worth[part.pixels]).sum(dim=1)
+            for part, rows in plan.kernels.parts()
+        ]
+    return torch.cat(values)

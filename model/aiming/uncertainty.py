@@ -5,7 +5,7 @@ accuracy. Each of the given worlds has images of one draw of these surfaces, and
 with the others. Errors of many mirrors average out in the power, less so in the peak.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,15 +44,16 @@ class PlanUncertainty:
 
 
 def plan_uncertainty(
-    plan: AimPlan, worlds: Sequence[Kernels] = (), own: Draws | None = None
+    plan: AimPlan, worlds: Sequence[Callable[[], Kernels]] = (), own: Draws | None = None
 ) -> PlanUncertainty:
     """Judge a plan by `DRAWS` draws of pointing errors and surfaces, at least one for each world.
 
     Parameters
     ----------
     plan : AimPlan
-    worlds : sequence of Kernels
-        Of the same mirrors with drawn surfaces; by default the plan's kernels alone.
+    worlds : sequence of callables
+        Each makes kernels of the same mirrors with drawn surfaces, one at a time in memory; by
+        default the plan's kernels alone.
     own : Draws, optional
         The plan's, if they were traced before; without worlds these are what it is judged by.
 
@@ -64,7 +65,7 @@ def plan_uncertainty(
     if worlds:
         each = max(1, DRAWS // len(worlds))
         # A seed for each world: the same errors in all of them would hide part of the spread.
-        drawn = [judged_on(plan, one).draws(each, seed) for seed, one in enumerate(worlds)]
+        drawn = [judged_on(plan, make()).draws(each, seed) for seed, make in enumerate(worlds)]
     else:
         drawn = [own or plan.draws()]
     powers, peaks, ratios = (

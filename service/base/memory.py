@@ -9,6 +9,8 @@ _M_ARENA_MAX = -8
 
 _ARENAS = 2
 
+_libc = ctypes.CDLL(None) if sys.platform.startswith("linux") else None
+
 
 def limit_memory() -> bool:
     """Limit glibc to a few arenas; False without glibc, or if ``MALLOC_ARENA_MAX`` is set.
@@ -16,7 +18,17 @@ def limit_memory() -> bool:
     Otherwise each thread gets an arena, up to eight per core, which keeps freed memory. The forty
     threads of the routes would each keep the memory of images and their spectra.
     """
-    if not sys.platform.startswith("linux") or "MALLOC_ARENA_MAX" in os.environ:
+    if "MALLOC_ARENA_MAX" in os.environ:
         return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has no such function.
+    mallopt = getattr(_libc, "mallopt", None)  # musl has no such function.
     return mallopt is not None and mallopt(_M_ARENA_MAX, _ARENAS) == 1
+
+
+def return_memory() -> None:
+    """Return freed memory to the system, as far as glibc still holds it.
+
+    Blocks that are used lie between freed ones after large computations, and glibc keeps those.
+    """
+    trim = getattr(_libc, "malloc_trim", None)
+    if trim is not None:
+        trim(0)

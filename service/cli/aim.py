@@ -3,7 +3,9 @@
 import csv
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from model.aiming.kernels import Kernels, KernelTracer, join
+from model.aiming.kernels import ImageTracer, Kernels, MirrorImages, require_few_pairs
 from model.aiming.plan import AimPlan, plan_aims
 from model.aiming.uncertainty import plan_uncertainty
 from model.errors import InvalidInputError
 from model.fleet import Superposition, tiles
 from model.setup import Setup
+from service.base.memory import return_memory
 from service.base.progress import Progress
 from service.cli.field import FieldRequest, light_field, trace_field
 from service.sources.folder import read_height_std
@@ -114,17 +117,25 @@ _ALIKE = 1.5
 """Distance, in control points, over which errors of a surface are alike."""
 
 
-def _drawn_worlds(plant: PlantDescription, request: FieldRequest, step: Progress) -> list[Kernels]:
-    """Kernels of drawn surfaces, none if no surface of the request has standard deviations."""
+def _drawn_worlds(
+    plant: PlantDescription, request: FieldRequest, step: Progress
+) -> list[Callable[[], Kernels]]:
+    """Makers of kernels with drawn surfaces.
+
+    There are none if no surface of the request has standard deviations.
+    """
     if request.surfaces is None or not any(
         read_height_std(request.surfaces, one) is not None
         for one in plant.plant.heliostats.values()
     ):
         return []
-    return [
-        trace_kernels(plant, request, step, np.random.default_rng(seed)).kernels
-        for seed in range(_WORLDS)
-    ]
+    return [partial(_drawn_world, plant, request, step, seed) for seed in range(_WORLDS)]
+
+
+def _drawn_world(
+    plant: PlantDescription, request: FieldRequest, step: Progress, seed: int
+) -> Kernels:
+    return trace_kernels(plant, request, step, np.random.default_rng(seed)).kernels
 
 
 def _drawn(setup: Setup, surfaces: Path, rng: np.random.Generator) -> Setup:
@@ -152,20 +163,24 @@ def trace_kernels(
     of the surfaces that have standard deviations.
     """
     lit = light_field(plant, request, ROWS, in_front=True)
-    goal, skipped, parts = lit.task.receiver.aim, dict[str, str](), list[Kernels]()
+    require_few_pairs(len(lit.aimed.setups), lit.task.resolution)
+    goal, skipped, parts = lit.task.receiver.aim, dict[str, str](), list[MirrorImages]()
     setups = sorted(lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, goal))
     if rng is not None and request.surfaces is not None:
         setups = [_drawn(setup, request.surfaces, rng) for setup in setups]
     for tile in tiles(setups, lit.neighbours):
-        found = KernelTracer(lit.task)(tile)
+        found = ImageTracer(lit.task)(tile)
         skipped |= found.skipped
-        if found.kernels is not None:
-            parts.append(found.kernels)
-            step(f"images of {len(tile)} heliostats")
+        parts += found.images
+        step(f"images of {len(tile)} heliostats")
     if not parts:
         reason = next(iter(skipped.values()), "the layout gives it none")
         raise InvalidInputError(f"no heliostat sends light to {request.receiver}: {reason}")
-    return TracedKernels(join(parts), lit.task, skipped)
+    images = MirrorImages.join(parts)
+    parts.clear()
+    return_memory()
+    kernels = images.on_map(lit.task.receiver, lit.task.resolution)
+    return TracedKernels(kernels, lit.task, skipped)
 
 
 def write_aims(path: Path, plan: AimPlan) -> None:

@@ -19,6 +19,9 @@ Heliostats = Annotated[
     Field(min_length=1, max_length=20_000, description="Names of heliostats; all without it."),
 ]
 
+MAX_PIXELS = 10_000_000
+"""Maximum number of pixels of a plan's maps over all times: 40 MB for each kind of map."""
+
 
 def chosen_names(runtime: Runtime, names: Sequence[str] | None) -> list[str]:
     """The requested heliostats without duplicates; all stored ones if ``names`` is None."""

@@ -25,7 +25,11 @@ def enqueue(
     ------
     NotFoundError
         If the payload of a new job names a heliostat or a target that is not stored.
+
+    The kind's ``require`` may raise others.
     """
+    if kind.require is not None:
+        kind.require(payload, runtime)
     settings, document = runtime.settings, payload.model_dump(mode="json")
     bounds = Bounds(settings.max_queued_jobs, settings.max_queued_jobs_of_key)
     is_short = (

@@ -196,7 +196,7 @@ class Kind(Generic[Payload]):
       Such a job starts once, with an empty payload.
     - ``so_far`` makes a result of the completed steps, for a job that did not finish.
     - ``details`` names the step with the part of the result that only the whole job shows.
-    - ``require`` checks payload and settings before a job is queued.
+    - ``require`` checks the payload against settings and store before a job is queued.
     - ``existing`` returns the job of a payload that has only one, None if it has none yet. It locks
       out others that would queue it.
     - ``expected_s`` estimates the duration [s] from the payload and what is stored. A kind without
@@ -210,7 +210,7 @@ class Kind(Generic[Payload]):
     due: Callable[[Session, Settings], str | None] | None = None
     so_far: Callable[[Mapping[str, Mapping[str, Any]]], Mapping[str, object]] | None = None
     details: str | None = None
-    require: Callable[[Payload, Settings], object] | None = None
+    require: Callable[[Payload, Runtime], object] | None = None
     existing: Callable[[Session, Payload, Settings], JobRow | None] | None = None
     expected_s: Callable[[Payload, Runtime], float] | None = None
 

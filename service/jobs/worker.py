@@ -314,6 +314,7 @@ class Workers:
         self._runtime.compute_slots.forget(stuck.ident)
         self._runtime.decoding_slots.forget(stuck.ident)
         self._runtime.large_image_slots.forget(stuck.ident)
+        self._runtime.large_plan_slots.forget(stuck.ident)
         logger.error(
             "another thread takes the place of %s; what that one holds it keeps until a restart",
             stuck.name,

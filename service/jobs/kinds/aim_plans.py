@@ -4,6 +4,7 @@ import math
 import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from datetime import time as clock
@@ -18,9 +19,10 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.aiming.kernels import Kernels, aim_in_front
+from model.aiming.kernels import LARGE_PAIRS, Kernels, aim_in_front, require_few_pairs
 from model.aiming.plan import AimPlan, plan_aims
 from model.ephemeris import sun_positions
+from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Receiver, square_pixels
 from model.times import format_minute, format_time
@@ -38,7 +40,7 @@ from service.base.fields import (
     SunAt,
     parse_moment,
 )
-from service.jobs.common import require_some
+from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.field_forecasts import Fleet, FleetForecastIn, expected_s
 from service.sources.limits import Limit
@@ -112,22 +114,35 @@ class DayIn(Model):
         if self.last < self.first:
             raise ValueError("last: give a time after first")
         if self.count() > MAX_STEPS:
-            raise ValueError(
-                f"step_minutes: {self.count()} steps are too many; a day has at most {MAX_STEPS}"
-            )
+            raise ValueError(_too_many_steps(self.count()))
         return self
 
     def count(self) -> int:
-        """Number of steps, also of those with the sun below the horizon."""
+        """Number of steps, also of those with the sun below the horizon.
+
+        On a day of a clock change `times` has an hour's steps more or fewer.
+        """
         length = datetime.combine(self.date, self.last) - datetime.combine(self.date, self.first)
         return length // timedelta(minutes=self.step_minutes) + 1
 
-    def times(self, zone: str) -> Iterator[datetime]:
-        """The times of the steps in UTC, for the plant's time zone."""
-        begin = datetime.combine(self.date, self.first, ZoneInfo(zone)).astimezone(UTC)
-        return (
-            begin + number * timedelta(minutes=self.step_minutes) for number in range(self.count())
-        )
+    def times(self, zone: str) -> list[datetime]:
+        """The times of the steps in UTC, for the plant's time zone.
+
+        A time that the clocks of a day show twice begins with the first, and ends with the second.
+        """
+        first, *_ = _in_utc(self.date, self.first, zone)
+        last, step = max(_in_utc(self.date, self.last, zone)), timedelta(minutes=self.step_minutes)
+        return [first + number * step for number in range((last - first) // step + 1)]
+
+
+def _in_utc(day: date, at: clock, zone: str) -> list[datetime]:
+    """What a time of day in a zone can be: it differs only if clocks show it twice, or never."""
+    local = datetime.combine(day, at, ZoneInfo(zone))
+    return [local.replace(fold=fold).astimezone(UTC) for fold in (0, 1)]
+
+
+def _too_many_steps(count: int) -> str:
+    return f"step_minutes: {count} steps are too many; a day has at most {MAX_STEPS}"
 
 
 class AimPlanIn(FleetForecastIn):
@@ -175,7 +190,18 @@ class AimPlanIn(FleetForecastIn):
     def _sun_or_day(self) -> Self:
         if (self.sun is None) == (self.day is None):
             raise ValueError("give either sun or day")
+        if self.day is not None and self.resolution is not None:
+            count, (rows, columns) = self.day.count(), self.resolution
+            if count * rows * columns > MAX_PIXELS:
+                raise ValueError(
+                    f"day.step_minutes, resolution: {count} steps of {rows} x {columns} pixels are"
+                    f" too many; a plan has at most {MAX_PIXELS} pixels in all of them together"
+                )
         return self
+
+    def map_on(self, receiver: Receiver) -> Resolution:
+        """Rows and columns of the map."""
+        return self.resolution or square_pixels(receiver, ROWS)
 
     def limit(self) -> Limit:
         """The limit over the map."""
@@ -203,7 +229,7 @@ def _suns(session: Session, payload: AimPlanIn, zone: str) -> _Suns:
         at = payload.sun.at if isinstance(payload.sun, SunAt) else None
         day = None if at is None else at.astimezone(ZoneInfo(zone)).date()
         return _Suns([(at, position_of(session, payload.sun))], [], zone, day)
-    times = list(payload.day.times(zone))
+    times = payload.day.times(zone)
     angles = sun_positions(times, store.get_plant(session).origin).tolist()
     steps: list[tuple[datetime | None, Sun]] = []
     below = []
@@ -237,6 +263,7 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     with runtime.database.reading() as session:
         suns = _suns(session, payload, plant_time_zone(session, runtime.settings.time_zone))
     fleet = payload.fleet(runtime)
+    require_few_pairs(len(fleet.names), payload.map_on(fleet.receiver))
     names = _require_few_aims(fleet, suns)
     with runtime.database.reading() as session:
         drives = AimDrives.read(session, names, fleet.model)
@@ -248,7 +275,8 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     planner = _Planner(context, payload, fleet, _in_front(runtime, fleet), drives, suns)
     for index in range(len(suns.steps)):
         if step_name(index) not in done:
-            planner.plan(index)
+            with planner.memory():
+                planner.plan(index)
     return _result(context, payload, planner)
 
 
@@ -310,11 +338,21 @@ class _Planner:
     drives: AimDrives
     suns: _Suns
 
+    @contextmanager
+    def memory(self) -> Iterator[None]:
+        """Hold the memory of the images: one plan of many pixels has it at a time."""
+        runtime, (rows, columns) = self.context.runtime, self.asked.map_on(self.fleet.receiver)
+        if len(self.fleet.names) * rows * columns <= LARGE_PAIRS:
+            yield
+            return
+        with runtime.large_plan_slots.slot(check=self.context.check):
+            yield
+
     def plan(self, index: int) -> None:
         """Plan a step and store it."""
         context, receiver = self.context, self.fleet.receiver
         at, sun = self.suns.steps[index]
-        resolution = self.asked.resolution or square_pixels(receiver, ROWS)
+        resolution = self.asked.map_on(receiver)
         begun = time.perf_counter()
         group = self.nearest_first.under(sun, self.asked.surface == "ideal")
         images = self._images(index, group, resolution)
@@ -548,8 +586,25 @@ class PlannedAims:
 def expected_plan_s(payload: AimPlanIn, runtime: Runtime) -> float:
     """Estimated duration [s]: images, aims, and what they are compared with."""
     count = 1 if payload.day is None else payload.day.count()
-    request = payload.model_copy(update={"resolution": (ROWS, 2 * ROWS)})
+    request = payload.model_copy(update={"resolution": payload.resolution or (ROWS, 2 * ROWS)})
     return 4 * count * expected_s(request, runtime)
+
+
+def require_bounds(payload: AimPlanIn, runtime: Runtime) -> None:
+    """Refuse too many pixels for the heliostats, and too many steps.
+
+    Raises
+    ------
+    InvalidInputError
+        With the field.
+    """
+    if payload.day is not None:
+        with runtime.database.reading() as session:
+            zone = plant_time_zone(session, runtime.settings.time_zone)
+        if (count := len(payload.day.times(zone))) > MAX_STEPS:
+            raise InvalidInputError(f"day.{_too_many_steps(count)}")
+    fleet = payload.fleet(runtime)
+    require_few_pairs(len(fleet.names), payload.map_on(fleet.receiver))
 
 
 KIND = Kind(
@@ -558,5 +613,6 @@ KIND = Kind(
     plan_field,
     "Find the aim points of the most power under a limit of flux.",
     details=_AIMS,
+    require=require_bounds,
     expected_s=expected_plan_s,
 )

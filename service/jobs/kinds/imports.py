@@ -18,6 +18,7 @@ from service.sources.files import confined_to
 from service.sources.folder import MeasurementFolder, read_folder
 from service.store.job_tables import JobRow
 from service.store.rows import serialize_writers
+from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.importing import Imported, import_folder
 
 
@@ -68,9 +69,9 @@ def allowed_folder(root: Path, folder: str) -> Path:
     return path
 
 
-def _require_folder(payload: ImportIn, settings: Settings) -> None:
+def _require_folder(payload: ImportIn, runtime: Runtime) -> None:
     if not payload.uploaded:
-        import_root(settings)
+        import_root(runtime.settings)
 
 
 def _job_of_upload(session: Session, payload: ImportIn, settings: Settings) -> JobRow | None:

@@ -16,7 +16,7 @@ from model.receivers import Cavity, Panels
 from model.times import format_minute, format_time
 from service import store
 from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text, VersionIn
-from service.jobs.common import require_some
+from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.aim_plans import PlannedAims
 from service.jobs.kinds.field_forecasts import Fleet, FleetIn, expected_s
@@ -27,9 +27,6 @@ from service.twin.runtime.runtime import Runtime
 
 MAX_TIMES = 100
 """Maximum number of times of a plan."""
-
-MAX_PIXELS = 10_000_000
-"""Maximum number of pixels of the twin's maps over all times. With the ideal maps this is 80 MB."""
 
 PlanName = Annotated[Text, StringConstraints(min_length=1, max_length=80, strip_whitespace=True)]
 

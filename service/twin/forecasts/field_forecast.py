@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.aiming.kernels import Kernels, KernelTracer, join
+from model.aiming.kernels import ImageTracer, Kernels, MirrorImages
 from model.errors import ModelError
 from model.fleet import (
     TILE,
@@ -28,6 +28,7 @@ from model.surface import control_points
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
+from service.base.memory import return_memory
 from service.base.progress import Report
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow
@@ -180,16 +181,19 @@ def trace_kernels(
     field = _seen_neighbours(runtime, fleet, report, _NEIGHBOURS_SHARE) if neighbours else None
     count = math.ceil(len(fleet.names) / TILE)
     traced = _Counted(report, "images of mirrors", count, _NEIGHBOURS_SHARE, 0.5)
-    engine, found = engine_of(runtime), list[Kernels]()
+    engine, found = engine_of(runtime), list[MirrorImages]()
     task = _task(fleet, resolution, neighbours, engine, lambda: traced(len(found)))
-    for tile in engine.map(KernelTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
+    for tile in engine.map(ImageTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
         fleet.skipped.update(tile.skipped)
-        found += [] if tile.kernels is None else [tile.kernels]
+        found += tile.images
         traced(len(found))
     if not found:
         name, reason = next(iter(fleet.skipped.items()), ("the store", "it holds no heliostat"))
         raise ConflictError(f"no heliostat reaches {fleet.receiver.name}; {name}: {reason}")
-    return join(found)
+    images = MirrorImages.join(found)
+    found.clear()
+    return_memory()
+    return images.on_map(fleet.receiver, resolution)
 
 
 @dataclass(frozen=True, eq=False)

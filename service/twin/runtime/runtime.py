@@ -129,6 +129,8 @@ class Runtime:
     """Slots for decoded photographs, which limit the memory of their pixels; see `decoded`."""
     large_image_slots: ComputeSlots = field(default_factory=lambda: ComputeSlots(1))
     """Single slot for photographs of more than `LARGE_PIXELS`."""
+    large_plan_slots: ComputeSlots = field(default_factory=lambda: ComputeSlots(1))
+    """Single slot for plans of aims with many heliostats and pixels; see `model.aiming.kernels`."""
     recent_images: LargeResults = field(default_factory=lambda: LargeResults(256_000_000))
     """Images of the mirrors of recent plans: another limit takes the same ones."""
     timeout_s: float | None = None

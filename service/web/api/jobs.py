@@ -170,8 +170,6 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         response: Response,
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
-        if kind.require is not None:
-            kind.require(payload, runtime.settings)
         row = enqueue(runtime, kind, payload, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
         return job_out(row)

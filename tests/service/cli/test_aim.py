@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from model.aiming import kernels, plan
+from model.aiming.bound import bound_power
+from model.aiming.kernels import require_few_pairs
+from model.aiming.plan import linear_draws, mirror_values, single_aim
 from model.errors import InvalidInputError
 from model.surface import control_points
 from service.base.progress import no_progress
@@ -146,15 +150,56 @@ def test_a_limit_is_a_positive_number_or_a_file(plant: Path, tmp_path: Path, lim
 
 def test_a_quarter_of_the_pixels_has_the_same_light(plant: Path):
     request = FieldRequest("board", 180.0, 55.0, 900.0, resolution=(31, 33))
-    kernels = trace_kernels(read_plant(plant), request, no_progress).kernels
-    thin = kernels.thinned()
-    moved = torch.zeros(len(kernels), 2)
-    whole, some = kernels.flux(moved), thin.kernels.flux(moved)
-    assert float(thin.kernels.areas.sum()) == pytest.approx(float(kernels.areas.sum()), rel=1e-5)
+    found = trace_kernels(read_plant(plant), request, no_progress).kernels
+    thin = found.thinned()
+    moved = torch.zeros(len(found), 2)
+    whole, some = found.flux(moved), thin.kernels.flux(moved)
+    assert float(thin.kernels.areas.sum()) == pytest.approx(float(found.areas.sum()), rel=1e-5)
     assert len(some) == 16 * 17
     assert np.isin(some.numpy(), whole.numpy()).all()
-    power = float(whole @ kernels.areas)
+    power = float(whole @ found.areas)
     assert float(some @ thin.kernels.areas) == pytest.approx(power, rel=0.01)
+
+
+def test_parts_of_the_kernels_do_not_change_a_plan(plant: Path, monkeypatch: pytest.MonkeyPatch):
+    """Light, draws and values are those of all pairs at once, and a pair takes 16 bytes."""
+    request = FieldRequest("main", 180.0, 55.0, 900.0, resolution=(16, 40))
+    read = read_plant(plant)
+    whole = trace_kernels(read, request, no_progress).kernels
+    assert whole.places.dtype == whole.factors.dtype == torch.float32
+    pairs = [getattr(whole, name).nbytes for name in ("places", "factors", "pixels")]
+    assert sum(pairs) == 16 * whole.pixels.numel() < 16 * len(whole) * 16 * 40
+    limit = torch.full_like(whole.areas, 80e3)
+    at_once = single_aim(whole, limit)
+    drawn, value, bound = linear_draws(at_once), mirror_values(at_once), bound_power(at_once, 1)
+    monkeypatch.setattr(kernels, "_PART", 2000)
+    monkeypatch.setattr(plan, "_DENSE", 5000)
+    parts = trace_kernels(read, request, no_progress).kernels
+    assert max(part.pixels.numel() for part, _ in parts.parts()) <= 2000
+    in_parts = single_aim(parts, limit)
+    assert torch.equal(in_parts.flux, at_once.flux)
+    some = linear_draws(in_parts)
+    assert torch.allclose(some.sigma, drawn.sigma)
+    np.testing.assert_allclose(some.ratios, drawn.ratios, rtol=1e-5)
+    assert torch.allclose(mirror_values(in_parts), value, rtol=1e-4)
+    assert bound_power(in_parts, 1) == pytest.approx(bound, rel=1e-4)
+    moved = torch.zeros(len(parts), 2, requires_grad=True)
+    gradients = [
+        torch.autograd.grad(one.flux(moved)[:300].sum(), moved)[0] for one in (parts, whole)
+    ]
+    assert torch.allclose(*gradients, rtol=1e-3, atol=1e-2)
+
+
+def test_too_many_pixels_for_the_heliostats_are_refused(plant: Path, tmp_path: Path):
+    require_few_pairs(2650, (137, 137))
+    with pytest.raises(InvalidInputError, match=r"^resolution: 1024 x 1024 .* here 18867 pixels;"):
+        require_few_pairs(2650, (1024, 1024))
+    done = heliotwin(
+        "aim", plant, "--receiver", "main", "--limit", 80, "--resolution", 1024, 1024, "--out",
+        tmp_path / "aims.csv", "--report", tmp_path / "report.json", *SUN,
+    )  # fmt: skip
+    ends(done, 2, "resolution: 1024 x 1024 pixels for each of")
+    assert not (tmp_path / "aims.csv").exists()
 
 
 @pytest.mark.full

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.aiming.kernels import KernelTracer, join
+from model.aiming.kernels import ImageTracer, MirrorImages
 from model.fleet import FleetFlux, Superposition, Tile, aligned_field, superpose, tiles
 from model.frames import sun_direction
 from model.plant import Heliostat
@@ -68,15 +68,15 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
 
 @pytest.mark.full
 def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
-    task = KernelTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
-    kernels, expected = (
-        join(made.kernels for made in engine.map(task, some_tiles()) if made.kernels is not None)
+    task = ImageTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
+    images, expected = (
+        MirrorImages.join([one for tile in engine.map(task, some_tiles()) for one in tile.images])
         for engine in (Ray("local"), Threads(1))
     )
-    assert kernels.names == expected.names
-    assert len(kernels) == 32
-    for name in ("expected", "sharp", "sides", "spread", "places", "factors"):
-        assert torch.equal(getattr(kernels, name), getattr(expected, name))
+    assert images.names == expected.names
+    assert len(images) == 32
+    for name in ("expected", "sharp", "sides", "spread", "aims", "axes"):
+        assert torch.equal(getattr(images, name), getattr(expected, name))
 
 
 @pytest.mark.full

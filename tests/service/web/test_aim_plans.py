@@ -1,7 +1,11 @@
 """The job `aim-plans` on an imported plant, and its page."""
 
 import re
+import threading
 from collections.abc import Callable, Iterator
+from datetime import date, timedelta
+from datetime import time as clock
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -10,8 +14,10 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from model.aiming import kernels
 from model.frames import sun_direction
 from service import store
+from service.base.fields import start_of_day
 from service.jobs import kind
 from service.jobs.kinds import aim_plans
 from service.sources.documents import read_heliostat
@@ -24,6 +30,7 @@ from service.twin.transfer.importing import import_folder
 from tests.page import Page
 from tests.service import real
 from tests.service.sources.aim_plant import write_aim_plant
+from tests.waiting import until
 
 BODY = {
     "target": "main",
@@ -75,7 +82,6 @@ def test_page_shows_the_plan_and_gives_its_aims(plant: TestClient, tmp_path: Pat
     ]
 
 
-@pytest.mark.full
 def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
     first = planned(plant)["result"]
     again = planned(plant, aim_points_m=first["aim_points_m"])["result"]
@@ -270,6 +276,92 @@ def test_a_wrong_day_is_refused_by_its_name(plant: TestClient, changes: dict[str
     assert said in str(answer.json())
 
 
+def test_too_many_pixels_for_the_heliostats_are_refused(
+    plant: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    """Before a job is queued, also by the form, whose map has the default resolution."""
+    answer = plant.post("/v1/jobs/aim-plans", json=BODY | {"resolution": [1024, 1024]})
+    assert answer.status_code == 422
+    assert answer.json()["detail"].startswith("resolution: 1024 x 1024 pixels for each of")
+    monkeypatch.setattr(kernels, "MAX_PAIRS", 1000)
+    for body in (BODY, DAY):
+        assert plant.post("/v1/jobs/aim-plans", json=body).status_code == 422
+    form = {"name": "June", "target": "main", "allowed_kw_m2": "80"}
+    form |= {"first_at": "2026-06-21T11:00", "last_at": "2026-06-21T11:00"}
+    answer = plant.post("/aims", data=form)
+    assert (answer.status_code, "pixels for each of" in answer.text) == (422, True)
+
+
+def test_a_day_of_too_many_pixels_is_refused(plant: TestClient):
+    day = {"day": DAY["day"] | {"step_minutes": 60}, "resolution": [1024, 1024]}
+    answer = plant.post("/v1/jobs/aim-plans", json=DAY | day)
+    assert answer.status_code == 422
+    assert "resolution: 11 steps of 1024 x 1024 pixels" in str(answer.json())
+
+
+def test_a_plan_of_many_pixels_waits_for_another_one(
+    plant: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    """It is cancelled while another one has the memory, and no images were traced."""
+    monkeypatch.setattr(aim_plans, "LARGE_PAIRS", 0)
+    monkeypatch.setattr(kind, "_REPORT_EVERY_S", 0.0)
+    traces = counted(monkeypatch, "trace_kernels", lambda _: None)
+    runtime = real.runtime_of(plant)
+    body = BODY | {"heliostats": some_names(plant)[:3]}
+    path = plant.post("/v1/jobs/aim-plans", json=body).headers["Location"]
+    worker = threading.Thread(target=real.worker(plant).work)
+    with runtime.large_plan_slots.slot():
+        worker.start()
+        until(lambda: plant.get(path).json()["state"] == "running")
+        plant.post(f"{path}/cancel")
+        worker.join()
+    assert (plant.get(path).json()["state"], traces) == ("cancelled", [])
+    assert planned(plant, **body)["state"] == "done"
+
+
+def test_a_plan_of_many_pixels_is_no_short_job(plant: TestClient):
+    runtime, names = real.runtime_of(plant), some_names(plant)
+    coarse, fine = (
+        aim_plans.expected_plan_s(
+            aim_plans.AimPlanIn(**BODY, heliostats=names, resolution=resolution), runtime
+        )
+        for resolution in (None, (1024, 1024))
+    )
+    assert coarse < runtime.settings.short_job_s < fine
+
+
+@pytest.mark.parametrize(
+    ("zone", "day", "hours"),
+    [
+        ("America/Los_Angeles", date(2026, 3, 8), 23),
+        ("America/Los_Angeles", date(2026, 11, 1), 25),
+        ("Europe/Berlin", date(2026, 3, 29), 23),
+        ("Europe/Berlin", date(2026, 10, 25), 25),
+        ("Europe/Berlin", date(2026, 6, 21), 24),
+    ],
+)
+def test_a_day_ends_when_its_clocks_say(zone: str, day: date, hours: int):
+    """Also on a day of a clock change."""
+    times = aim_plans.DayIn(date=day).times(zone)
+    assert len(times) == hours
+    assert {at.astimezone(ZoneInfo(zone)).date() for at in times} == {day}
+    until_noon = aim_plans.DayIn(date=day, last=clock(12)).times(zone)
+    assert until_noon[-1].astimezone(ZoneInfo(zone)).time() == clock(12)
+    assert {b - a for a, b in pairwise(times)} == {timedelta(hours=1)}
+    # The day of cameras and of lost light is as long.
+    begin, end = (start_of_day(day, zone, later) for later in (0, 1))
+    assert begin is not None
+    assert end == begin + timedelta(hours=hours)
+
+
+def test_a_longer_day_has_no_more_steps_than_others(plant: TestClient):
+    """The clocks of Madrid show two o'clock twice."""
+    day = {"date": "2026-10-25", "first": "01:30", "last": "03:05", "step_minutes": 1}
+    answer = plant.post("/v1/jobs/aim-plans", json=DAY | {"day": day})
+    assert answer.status_code == 422
+    assert answer.json()["detail"].startswith("day.step_minutes: 156 steps are too many")
+
+
 def outdated(client: TestClient) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = client.get(
         "/v1/alarms", params={"reason": "aims_outdated"}
@@ -332,7 +424,6 @@ def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pyt
     assert len(traces) == 2
 
 
-@pytest.mark.full
 def test_cancelled_day_ends_between_steps(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
     path = plant.post("/v1/jobs/aim-plans", json=DAY).headers["Location"]
 
