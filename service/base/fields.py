@@ -541,9 +541,9 @@ class ClockReport(BaseModel):
 
 
 class MountHistory(BaseModel):
-    """The times of the measurements."""
+    """The times of the measurements; None where it is unknown."""
 
-    at: list[datetime] = Field(min_length=1)
+    at: list[datetime | None] = Field(min_length=1)
 
 
 class CheckedMountReport(MountReport):

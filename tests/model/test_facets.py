@@ -106,7 +106,7 @@ def test_changes_by_shapes_are_those_by_heights():
     torch.testing.assert_close(by_shape, dense, rtol=0, atol=1e-3 * float(change))
 
 
-@pytest.mark.parametrize("count", [1, 6, 25])
+@pytest.mark.parametrize("count", [1, 6, pytest.param(25, marks=pytest.mark.full)])
 def test_mirrors_of_any_facets_are_refined(count):
     """From three clean images; its light under another sun is forecast far better."""
     heliostat, prior = mirror(count), generic_prior(half_sizes(count))

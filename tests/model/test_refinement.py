@@ -52,12 +52,14 @@ def test_the_true_surface_is_approached(refined, truth):
     )
 
 
+@pytest.mark.full
 def test_a_start_at_the_truth_gains_nothing(refined, heliostat, truth):
     from_truth = refine(heliostat, images(heliostat, truth), JUELICH_MODEL, truth)
     assert surface_error(from_truth.z, refined.z) < 5e-5
     assert refined.misfit < from_truth.misfit + 1e-3
 
 
+@pytest.mark.full
 def test_a_start_far_off_is_left_for_the_prior_s_mean(refined, heliostat, truth):
     """From where canting is twelve standard deviations off, descent alone ends at another mirror, 4
     mm away.
@@ -69,6 +71,7 @@ def test_a_start_far_off_is_left_for_the_prior_s_mean(refined, heliostat, truth)
     assert surface_error(found.z, refined.z) < 2e-5
 
 
+@pytest.mark.full
 def test_a_rough_mirror_is_found(heliostat):
     """Its waviness half as much again as the prior expects, its canting less: the scales of its
     directions follow.
@@ -82,6 +85,7 @@ def test_a_rough_mirror_is_found(heliostat):
     assert np.mean(np.abs(found.z - rough) < 1.645 * found.z_std) > 0.8
 
 
+@pytest.mark.full
 def test_heights_do_not_compensate_what_they_cannot_resolve(heliostat, truth):
     """A mirror with ripples, found with them and without: without them heights make up for what
     they cannot be.
@@ -101,6 +105,7 @@ def test_heights_do_not_compensate_what_they_cannot_resolve(heliostat, truth):
     assert within[0] > within[1] + 0.2
 
 
+@pytest.mark.full
 def test_a_mirror_of_a_kind_that_nobody_measured_is_found(heliostat, truth):
     larger = tuple(
         Facet(1.5 * f.position, 1.5 * f.canting_x, 1.5 * f.canting_y) for f in heliostat.facets
@@ -127,6 +132,7 @@ def test_the_uncertainty_covers_the_error(refined, truth):
     assert 0.8 < np.mean(error < 1.645 * refined.z_std) <= 1
 
 
+@pytest.mark.full
 def test_intervals_hold_what_photographs_disagree_about(refined, heliostat, truth):
     """Under eastern suns the facets stand canted otherwise: no surface is right, and the answer
     says so.
@@ -200,6 +206,7 @@ def test_poor_image_has_less_weight(refined, heliostat, truth):
     assert surface_error(found.z, truth) < 2 * surface_error(refined.z, truth)
 
 
+@pytest.mark.full
 def test_adopted_effects_are_not_taken_for_shape(heliostat, truth):
     """A camera's response that the model knows spoils the surface no more; one that it does not
     know does.

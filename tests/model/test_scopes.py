@@ -269,6 +269,7 @@ def test_changed_camera_is_found_with_its_date():
     assert found["parameters"]["gamma"]["value"] == pytest.approx(1.1, abs=0.02)
 
 
+@pytest.mark.full
 def test_hazy_days_are_found_and_named():
     report = study_to_json(
         found_in([SunShapeEffect(0.02, scope=ByDay(HAZY))], "sun_shape", "slope_error")

@@ -202,7 +202,7 @@ def _fill(
         for name, value in missing.items():
             _assign(row, name, photograph, value)
         filled = list(missing)
-        if photograph.external_id is not None and store.add_alias(
+        if photograph.external_id not in (None, row.external_id) and store.add_alias(
             session, twin.row, row, photograph.external_id
         ):
             filled.append("id")

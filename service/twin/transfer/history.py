@@ -5,7 +5,8 @@
 
 - photographs as they came, with corrections,
 - all versions of its surface with decisions, and with arrays in ``surface-N.npz``,
-- its mounts.
+- its mounts,
+- its accuracy on its newest photograph, on arrival.
 
 Images of excluded photographs are also there, because other readers would use them in PAINT's
 place.
@@ -30,8 +31,10 @@ from service.base.arrays import unpack_untrusted
 from service.base.fields import (
     CheckedMountReport,
     CheckedStudyReport,
+    Name,
     Source,
     Sun,
+    Text,
     Verdict,
     Wgs84,
     from_row,
@@ -48,9 +51,11 @@ from service.store.photographs.measurements import (
 )
 from service.store.records import many, record
 from service.store.tables import (
+    UNLIKE_HELIOSTAT,
     AliasRow,
     CorrectionRow,
     DecisionRow,
+    DriftRow,
     HeliostatRow,
     MeasurementRow,
     ModelRow,
@@ -63,7 +68,8 @@ from service.store.tables import (
 
 FOLDER = "history"
 
-# Values that the import measures again from the image, so the export omits them.
+# Values that the import measures again from the image, so the export omits them. Of the warnings it
+# has that of the arrival.
 _MEASURED = ("accepted", "reason", "quality", "warnings", "center_right_m", "center_up_m")
 _FILE = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,160}$")]
 _Object = dict[str, object]
@@ -71,6 +77,7 @@ _Correction = record(CorrectionRow)
 _Motor = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Pixel = tuple[Annotated[float, Field(ge=-1e5, le=1e5)], Annotated[float, Field(ge=-1e5, le=1e5)]]
 _Corners = dict[Literal["corners"], tuple[_Pixel, _Pixel, _Pixel, _Pixel]]
+_Unlike = create_model("Unlike", detail=(Text, ...), like=(Name, ...))
 _Photograph = record(
     MeasurementRow,
     (*_MEASURED, "sun_azimuth_deg", "sun_elevation_deg"),
@@ -84,24 +91,28 @@ _Photograph = record(
     helios_spot_wgs84=(Wgs84 | None, None),
     corners_px=(Annotated[_Corners, Field(min_length=1)] | None, None),
     excluded=(bool, ...),
+    unlike=(_Unlike | None, ...),
     corrections=(many(_Correction), ...),
     aliases=(list[str], []),
 )
 _Surface = record(SurfaceRow, source=(Source, ...), photographs=(list[str], ...))
 _Decision = record(DecisionRow, version=(int, ...))
 _Mount = record(MountRow)
+_Drift = record(DriftRow, photograph=(str, ...), version=(int, ...))
 _History = create_model(
     "History",
     photographs=(many(_Photograph), ...),
     surfaces=(many(_Surface), ...),
     decisions=(many(_Decision), ...),
     mounts=(many(_Mount), ...),
+    drift=(_Drift | None, ...),
 )
 _Study = record(StudyRow, verdict=(Verdict, ...), number=(Annotated[int, Field(ge=1)], ...))
 _Model = record(ModelRow, study=(int | None, ...))
 _Models = create_model(
     "Models",
     declared=(_Object | None, ...),
+    corners=(dict[str, dict[str, Wgs84]], ...),
     studies=(many(_Study), ...),
     models=(many(_Model), ...),
 )
@@ -173,11 +184,13 @@ PLANT = f"{FOLDER}/plant.json"
 
 
 def plant_history(session: Session) -> Any:
-    """The declared model, all studies, and all model versions after the first."""
+    """The declared model, studies, later model versions, and targets' corners as they came."""
     studies = session.scalars(select(StudyRow).order_by(StudyRow.id)).all()
     models = session.scalars(select(ModelRow).order_by(ModelRow.number)).all()
+    targets = store.list_targets(session)
     return _Models(
         declared=store.get_plant(session).declared,
+        corners={target.name: target.corners for target in targets if target.corners},
         studies=[from_row(_Study, row, number=row.id) for row in studies],
         models=[from_row(_Model, row, study=row.study_id) for row in models],
     )
@@ -211,6 +224,8 @@ def restore_plant(session: Session, root: Path, actor: str) -> bool:
             "the store has other versions of the plant's model, which stay; use an empty store"
         )
     plant.declared = given.declared
+    for target in store.list_targets(session):
+        target.corners = given.corners.get(target.name)
     rows = [StudyRow(**study.model_dump(exclude={"number"})) for study in given.studies]
     for row in rows:
         session.add(row)
@@ -233,7 +248,7 @@ def _is_same(first: Any, second: Any) -> bool:
         versions = [
             model.model_dump() | {"study": places.get(model.study)} for model in models.models
         ]
-        return models.declared, studies, versions
+        return models.declared, models.corners, studies, versions
 
     return bool(counted(first) == counted(second))
 
@@ -293,6 +308,7 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
                 target=one.target.name,
                 image=images.get(one.identifier),
                 excluded=one.reason == EXCLUDED,
+                unlike=_unlike(one),
                 corrections=[
                     from_row(_Correction, correction) for correction in corrections.get(one.id, ())
                 ],
@@ -315,7 +331,22 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
         mounts=[
             from_row(_Mount, one) for one in session.scalars(mounts.order_by(MountRow.version))
         ],
+        drift=_drift(session, row, {one.id: one.identifier for one in of_heliostat}),
     )
+
+
+def _unlike(row: MeasurementRow) -> _Object | None:
+    found = (one for one in row.warnings or () if one["type"] == UNLIKE_HELIOSTAT)
+    return next(({name: one[name] for name in ("detail", "like")} for one in found), None)
+
+
+def _drift(session: Session, row: HeliostatRow, names: Mapping[int, str]) -> Any:
+    """The accuracy on the newest photograph, if that is one of ``names``."""
+    drift = session.get(DriftRow, row.id)
+    if drift is None or drift.measurement_id not in names:
+        return None
+    version = session.get_one(SurfaceRow, drift.surface_id).version
+    return from_row(_Drift, drift, photograph=names[drift.measurement_id], version=version)
 
 
 def load_heliostat(root: Path, name: str) -> Any:
@@ -338,11 +369,11 @@ def image_path(root: Path, name: str, photograph: Any) -> Path | None:
 
 
 def restore_heliostat(
-    session: Session, row: HeliostatRow, given: Any, root: Path, actor: str
+    session: Session, row: HeliostatRow, given: Any, root: Path, actor: str, n_facets: int
 ) -> bool:
     """Restore a heliostat's history; return False if nothing is missing.
 
-    The images must be stored already.
+    The images must be stored already. Its surfaces have ``n_facets``.
 
     Raises
     ------
@@ -368,7 +399,9 @@ def restore_heliostat(
         versions[one.version] = SurfaceRow(
             **one.model_dump(exclude={"photographs"}),
             heliostat_id=row.id,
-            arrays=_read_arrays(root / heliostat_folder(row.name) / surface_file(one.version)),
+            arrays=_read_arrays(
+                root / heliostat_folder(row.name) / surface_file(one.version), n_facets
+            ),
             measurements=[photographs[name] for name in one.photographs if name in photographs],
         )
         session.add(versions[one.version])
@@ -384,25 +417,46 @@ def restore_heliostat(
                 **one.model_dump(exclude={"version"}), heliostat_id=row.id, surface_id=surface
             )
         )
+    if given.drift is not None and given.drift.photograph in photographs:
+        session.add(_restored_drift(given.drift, row, photographs, versions))
     session.add_all(MountRow(**one.model_dump(), heliostat_id=row.id) for one in given.mounts)
     about = {"surfaces": len(given.surfaces), "photographs": len(photographs)}
     audit.record(session, actor, "heliostat.history_imported", f"heliostat {row.name}", **about)
     return True
 
 
-# Limit of a surface's arrays [bytes], which take less than 11 kB in double precision.
-_MAX_ARRAY_BYTES = 2**20
-_ARRAYS = {"z": (4, 8, 8), "z_std": (4, 8, 8), "control_points": (4, 8, 8, 3)}
+def _restored_drift(
+    given: Any,
+    row: HeliostatRow,
+    photographs: Mapping[str, MeasurementRow],
+    versions: Mapping[int, SurfaceRow],
+) -> DriftRow:
+    if given.version not in versions:
+        raise InvalidInputError(
+            f"drift is of version {given.version}, which is missing; export the folder again"
+        )
+    return DriftRow(
+        **given.model_dump(exclude={"photograph", "version"}),
+        heliostat_id=row.id,
+        measurement_id=photographs[given.photograph].id,
+        surface_id=versions[given.version].id,
+    )
 
 
-def _read_arrays(path: Path) -> bytes:
+# Limit of a surface's arrays [bytes]: 20 kB for each facet, in double precision.
+_MAX_ARRAY_BYTES = 2**24
+
+
+def _read_arrays(path: Path, n_facets: int) -> bytes:
     """Read the packed arrays of a surface; InvalidInputError if they are not valid."""
     data = read_file(path, _MAX_ARRAY_BYTES)
     arrays = unpack_untrusted(data, _MAX_ARRAY_BYTES, str(path))
     shapes = {name: array.shape for name, array in arrays.items() if np.isfinite(array).all()}
-    if shapes != _ARRAYS:
+    heights = (n_facets, 8, 8)
+    expected = {"z": heights, "z_std": heights, "control_points": (*heights, 3)}
+    if shapes != expected:
         raise InvalidInputError(
-            f"{path}: must hold finite {_ARRAYS}, got {shapes}; export the folder again"
+            f"{path}: must hold finite {expected}, got {shapes}; export the folder again"
         )
     return data
 
@@ -441,6 +495,9 @@ def _restore_photographs(
             setattr(measurement, name, getattr(document, name))
         if document.excluded:
             measurement.accepted, measurement.reason = False, EXCLUDED
+        if document.unlike is not None and _unlike(measurement) is None:
+            unlike = {"type": UNLIKE_HELIOSTAT, **document.unlike.model_dump()}
+            measurement.warnings = [*(measurement.warnings or ()), unlike]
         for alias in document.aliases:
             if store.find_measurement(session, row, alias) is None:
                 session.add(

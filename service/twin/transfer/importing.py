@@ -148,23 +148,24 @@ def _import_heliostat(
         except UNREADABLE as error:
             skipped[key] = str(error)
 
-    stored = set[Path | None]()
+    stored = set[Path | str]()  # files of images, and names of positions without one
     for one in () if document is None else document.photographs:  # in the order in which they came
         file = history.image_path(folder.root, name, one)
-        stored.add(file)
+        stored |= {one.identifier, one.external_id or ""} if file is None else {file}
         put(f"{name}/{one.identifier} {one.kind}", photograph_with_target(one, one.target), file)
     for measurement in folder.measurements(name, with_images=False):
-        if not measurement.images:
+        if not measurement.images and measurement.identifier not in stored:
             put(measurement.key, measurement.photograph(None), None)
         for kind in sorted(measurement.images, key=IMAGE_KINDS.index):
             file = measurement.images[kind]
             if file not in stored:
                 put(f"{measurement.key} {kind}", measurement.photograph(kind), file)
     if document is not None:
+        n_facets = len(folder.plant.heliostats[name].facets)
 
         def restored(session: Session) -> bool:
             row = store.get_heliostat(session, name)
-            return history.restore_heliostat(session, row, document, folder.root, actor)
+            return history.restore_heliostat(session, row, document, folder.root, actor, n_facets)
 
         _restore(runtime, imported, name, restored)
 

@@ -16,6 +16,7 @@ from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow
 from tests.conftest import made_once
 from tests.service.conftest import until
+from tests.service.exported import MEASURED_AGAIN, require_round_trip
 from tests.service.real import client_on, runtime_of
 from tests.service.twin.test_causes import causes_of
 
@@ -106,3 +107,8 @@ def test_a_store_that_exists_stays(tmp_path: Path):
     seed_field(tmp_path / "plant", tmp_path / "data")
     assert not list((tmp_path / "data").iterdir())
     assert not (tmp_path / "plant").exists()
+
+
+@pytest.mark.full
+def test_the_field_goes_through_an_export(client: TestClient, tmp_path: Path):
+    require_round_trip(runtime_of(client), None, tmp_path, MEASURED_AGAIN)

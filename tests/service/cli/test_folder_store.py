@@ -34,6 +34,7 @@ def stored(pair_plant: Path, tmp_path: Path) -> Iterator[Runtime]:
     runtime.close()
 
 
+@pytest.mark.full
 def test_folder_and_store_are_one_plant(pair_plant: Path, stored: Runtime, tmp_path: Path):
     folder = read_folder(pair_plant)
     names = list(folder.plant.heliostats)

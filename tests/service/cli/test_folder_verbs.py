@@ -218,7 +218,8 @@ def test_effects_of_a_studys_report_are_added_to_the_declared_ones(single_plant,
         )
 
 
-@pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("number", [2, 5])
 def test_contract_on_undeclared_sets(undeclared, tmp_path, number):
     folder = undeclared / f"set-{number}"
     predictions = succeeds("predict", folder, "--out", tmp_path / "p")

@@ -17,7 +17,6 @@ from jsonschema import Draft7Validator
 from jsonschema.protocols import Validator
 from pystac.validation.local_validator import get_local_schema_cache
 from referencing import Registry
-from sqlalchemy import select
 
 from model.errors import InvalidInputError
 from model.pointing.kinematics import NAMES
@@ -28,25 +27,8 @@ from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.folder import read_folder, read_surface
 from service.sources.photograph import Photograph
-from service.store.columns import Base
 from service.store.pointing.mounts import add_mount
 from service.store.surfaces.surface_versions import NewSurface
-from service.store.tables import (
-    AliasRow,
-    CorrectionRow,
-    DecisionRow,
-    HeliostatRow,
-    ImageRow,
-    MeasurementRow,
-    ModelRow,
-    MountRow,
-    PlantRow,
-    ReceiverRow,
-    StudyRow,
-    SurfaceRow,
-    TargetRow,
-    surface_measurements,
-)
 from service.twin.heliostats.measurements import load_heliostat_context
 from service.twin.photographs.ingest import ingest
 from service.twin.plant import model_versions
@@ -54,6 +36,8 @@ from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
 from tests.service.conftest import QUIET, FakeOperations, png, poster, spot_of, sun_at
+from tests.service.exported import require_same
+from tests.service.exported import rows_of as exported_rows
 from tests.service.studies import SLOPE, study_row
 
 RECEIVER = {
@@ -174,65 +158,6 @@ def other(tmp_path: Path) -> Iterator[Runtime]:
     runtime.close()
 
 
-# Of every table that an export promises: columns that it does not, which this store alone knows of.
-PROMISED: dict[type[Base], set[str]] = {
-    PlantRow: set(),
-    HeliostatRow: {"created_at", "updated_at", "photographs_changed_at"},
-    TargetRow: {"updated_at", "corners"},
-    ReceiverRow: {"updated_at"},
-    ImageRow: {"created_at"},  # when it came to this store, from which it is kept
-    MeasurementRow: set(),
-    AliasRow: set(),
-    CorrectionRow: set(),
-    SurfaceRow: set(),
-    DecisionRow: set(),
-    MountRow: set(),
-    StudyRow: set(),
-    ModelRow: set(),
-}
-
-
-def history_rows(runtime: Runtime) -> dict[str, list[dict[str, Any]]]:
-    """All rows of the promised tables; rows that they refer to by their places."""
-    found, places = {}, {}
-    with runtime.database.reading() as session:
-        for kind, without in PROMISED.items():
-            table = kind.__table__
-            key = next(iter(table.primary_key))
-            rows = session.execute(select(table).order_by(key)).mappings().all()
-            places[table.name] = {row[key.name]: place for place, row in enumerate(rows)}
-            found[table.name] = [
-                {
-                    column.name: places[reference.column.table.name].get(row[column])
-                    if (reference := next(iter(column.foreign_keys), None)) is not None
-                    else row[column]
-                    for column in table.columns
-                    if column.name not in {*without, "id"}
-                }
-                for row in rows
-            ]
-        links = session.execute(select(surface_measurements)).all()
-    of = places["surfaces"], places["measurements"]
-    return found | {
-        "links": sorted(
-            tuple(there[key] for there, key in zip(of, link, strict=True)) for link in links
-        )
-    }
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two answers are the same, numbers to a millionth: places go to degrees and back."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    return (
-        bool(one == pytest.approx(other, abs=1e-6, rel=0))
-        if isinstance(one, float)
-        else bool(one == other)
-    )
-
-
 def test_round_trip_loses_nothing(
     filled: TestClient, exported: tuple[Path, dict[str, Any]], other: Runtime
 ):
@@ -243,7 +168,7 @@ def test_round_trip_loses_nothing(
     )  # who sent each photograph is kept
     assert done["skipped"] == {}
     app: FastAPI = filled.app  # type: ignore[assignment]
-    before, after = history_rows(app.state.runtime), history_rows(other)
+    before = exported_rows(app.state.runtime)
     assert {name: len(rows) for name, rows in before.items()} == {
         "plant": 1,
         "heliostats": 1,
@@ -258,10 +183,10 @@ def test_round_trip_loses_nothing(
         "mounts": 1,
         "studies": 1,
         "models": 2,
-        "links": 1,
+        "surface_measurements": 1,
+        "drift": 0,
     }
-    for name, rows in before.items():
-        assert same(rows, after[name]), (name, rows, after[name])
+    require_same(app.state.runtime, other)
 
 
 def test_forced_and_deleted_photographs_go_through_an_export(
@@ -317,11 +242,11 @@ def test_import_skips_an_image_that_another_heliostat_has_and_goes_on(
 
 def test_second_import_changes_nothing(exported: tuple[Path, dict[str, Any]], other: Runtime):
     import_folder(other, read_folder(exported[0]))
-    before = history_rows(other)
+    before = exported_rows(other)
     done = import_folder(other, read_folder(exported[0]))
     assert done["counts"]["histories unchanged"] == 2
     assert not [name for name in done["counts"] if name.endswith(" new")]
-    assert history_rows(other) == before
+    assert exported_rows(other) == before
 
 
 def test_photograph_that_is_sent_again_is_known(
@@ -377,7 +302,7 @@ def test_wrong_arrays_are_named_and_nothing_is_half_restored(
         file.write_bytes(content)
         done = import_folder(other, read_folder(exported[0]))
         assert str(file) in done["skipped"]["AA39 history"]
-        assert not history_rows(other)["surfaces"]
+        assert not exported_rows(other)["surfaces"]
 
 
 def test_history_that_contradicts_itself_is_refused(
@@ -391,7 +316,7 @@ def test_history_that_contradicts_itself_is_refused(
     file.write_text(json.dumps(document | {"surfaces": document["surfaces"][1:]}))
     done = import_folder(other, read_folder(exported[0]))
     assert "a decision is of version 1" in done["skipped"]["AA39 history"]
-    assert not history_rows(other)["surfaces"]
+    assert not exported_rows(other)["surfaces"]
 
 
 def _model(document: dict[str, Any]) -> None:
@@ -421,7 +346,7 @@ def test_a_model_that_could_not_be_computed_with_is_not_brought_back(
     done = import_folder(other, read_folder(exported[0]))
     assert str(file) in done["skipped"]["plant history"]
     assert done["counts"]["heliostats new"] == 1
-    assert not history_rows(other)["models"]
+    assert not exported_rows(other)["models"]
     with other.database.reading() as session:
         assert model_versions.get_model(session).effects == ()
 
@@ -470,7 +395,7 @@ def test_a_history_that_no_page_could_show_is_not_brought_back(
     done = import_folder(other, read_folder(exported[0]))
     assert str(file) in done["skipped"]["AA39 history"]
     assert done["counts"]["heliostats new"] == 1
-    assert not history_rows(other)["mounts"]
+    assert not exported_rows(other)["mounts"]
 
 
 def test_images_are_those_that_came(exported: tuple[Path, dict[str, Any]]):

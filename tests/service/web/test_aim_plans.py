@@ -82,6 +82,7 @@ def test_page_shows_the_plan_and_gives_its_aims(plant: TestClient, tmp_path: Pat
     ]
 
 
+@pytest.mark.full
 def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
     first = planned(plant)["result"]
     again = planned(plant, aim_points_m=first["aim_points_m"])["result"]
@@ -424,6 +425,7 @@ def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pyt
     assert len(traces) == 2
 
 
+@pytest.mark.full
 def test_cancelled_day_ends_between_steps(plant: TestClient, monkeypatch: pytest.MonkeyPatch):
     path = plant.post("/v1/jobs/aim-plans", json=DAY).headers["Location"]
 

@@ -45,6 +45,7 @@ def check(answer: Any, sent: Any) -> None:
     assert answer.status_code < 500, (sent, answer.text)
 
 
+@pytest.mark.full
 def test_messages_for_wrong_bodies_are_plain(client: TestClient, kinds: set[str]):
     defs = client.get("/openapi.json").json()["components"]["schemas"]
     headers = {"Content-Type": "application/json"}
@@ -64,6 +65,7 @@ def test_messages_for_wrong_bodies_are_plain(client: TestClient, kinds: set[str]
     assert len(kinds) > 15
 
 
+@pytest.mark.full
 def test_messages_for_wrong_parameters_are_plain(client: TestClient):
     for path, method, operation in operations(client):
         given = {"name": "AA39", "measurement": "1", "number": "1", "version": "1"}
