@@ -123,10 +123,6 @@ def test_name_of_an_uploaded_file_means_nothing(
 # --------------------------------------------------------------------------------------------------
 
 
-def test_oversized_image_is_refused(refused_post: Post):
-    assert refused_post(png(size=(600, 600))).status_code == 413
-
-
 @pytest.mark.parametrize("cut", [0, 1, 8, 20, 33, 60, -1, -20])
 def test_truncated_image_is_refused(refused_post: Post, cut: int):
     assert refused_post(png(size=(64, 64))[:cut]).status_code in (415, 422)

@@ -17,6 +17,7 @@ from service.web.auth import security
 from tests.service.access import all_routes
 from tests.service.conftest import Post, metadata, png, serving, sun_at
 from tests.service.web.problems import check
+from tests.service.web.promises import promise
 
 SUN = {"azimuth_deg": 180.0, "elevation_deg": 45.0}
 STAND_INS = [True, False, "1", "45.0", ""]
@@ -86,6 +87,7 @@ def test_other_types_are_refused_as_numbers(
             assert answer.status_code == 422, (place, value)
 
 
+@promise('Numbers are JSON\'s numbers: `"45"` and `true` are refused.')
 def test_other_types_are_refused_as_numbers_in_documents(
     refusing: TestClient, refused_post: Post, tower: Any, properties: Any
 ):

@@ -350,17 +350,6 @@ def test_a_refused_photograph_is_kept(client: TestClient, post: Post):
     assert set(re.findall(r"`(\w+)`", named[1])) == {*_REMEDY, "target_not_found", "excluded"}
 
 
-@pytest.mark.parametrize("value", ['"45"', "true", "null"])
-@promise('Numbers are JSON\'s numbers: `"45"` and `true` are refused.')
-def test_only_numbers_are_numbers(refused_post: Post, value: str):
-    document = json.dumps(metadata()).replace("45.0", value)
-    answer = refused_post(raw=document)
-    assert (answer.status_code, answer.json()["errors"][0]["field"]) == (
-        422,
-        "metadata.sun.elevation_deg",
-    )
-
-
 # --- times
 # --------------------------------------------------------------------------------------------------
 

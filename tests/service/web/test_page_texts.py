@@ -43,7 +43,7 @@ MASKS = {
 
 
 class Frozen(datetime):
-    """A clock that stands: ages on pages do not change."""
+    """A clock with one fixed time: ages on pages do not change."""
 
     @classmethod
     def now(cls, tz: tzinfo | None = None) -> "Frozen":
