@@ -4,7 +4,9 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,13 +29,13 @@ from model.setup import Setup
 from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
 from service.base.choices import Method
-from service.base.errors import list_reasons
+from service.base.errors import ConflictError, list_reasons
 from service.base.fields import Sun
 from service.base.progress import no_progress
 from service.base.settings import Settings
 from service.cli.demo_described import Demonstrated, write_southern_plant
-from service.cli.demo_field_store import seed_field
-from service.cli.demo_plant import write_plant
+from service.cli.demo_field_store import ACTOR, seed_field
+from service.cli.demo_plant import POSITIONS, write_plant
 from service.cli.field import FieldReport, FieldRequest, trace_field
 from service.cli.folder import observations_of, surface_errors, write_json
 from service.cli.folder_store import FolderStore
@@ -45,10 +47,12 @@ from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import PLANT
+from service.store import add_study as store_study
 from service.twin.forecasts.heliostat_forecast import ForecastRequest, make_forecast
 from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime import operations
 from service.twin.runtime.runtime import Runtime
+from service.twin.studies.study import StudyRequest, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
 from service.twin.transfer.importing import import_folder
 
@@ -105,22 +109,31 @@ def run_demos(
     if plant is not None:
         return _demonstrate(plant, out, console, quiet)
     root = out / "plant"
+    parts = 3 if has_field else 2
+    _announce(console, quiet, f"1 of {parts}: four mirrors of Juelich's kind, about 1 minute")
     with _bars(console, quiet) as bars:
-        write_plant(root, _counting(bars, 4))
+        write_plant(root, _counting(bars, "photograph a plant", len(POSITIONS)))
     report = run_demo(root, out, console, quiet)
+    _announce(console, quiet, f"2 of {parts}: two mirrors of 28 facets, about 1 minute more")
     with TemporaryDirectory(prefix="heliotwin-") as folder:
         file = write_southern_plant(Path(folder))
         other = _demonstrate(file, out, console, quiet)
     if has_field:
+        _announce(console, quiet, "3 of 3: 200 heliostats, some with faults, about 2 minutes more")
         store = out / "store-field"
         with _bars(console, quiet) as bars:
-            task = bars.add_task("a field with faults", total=None)
-            seed_field(out / "plant-field", store, lambda name: bars.update(task, advance=1))
+            seed_field(out / "plant-field", store, partial(_counting, bars, "a field with faults"))
         if not quiet:
             _print_next(
                 console, "a field of 200 heliostats with faults, to look at its pages", store
             )
     return {**report, "other_plant": other}
+
+
+def _announce(console: Console, quiet: bool, part: str) -> None:
+    """Say which part of the demonstration begins, and how long it takes on two cores."""
+    if not quiet:
+        console.print(f"\n{part}", style="bold", highlight=False)
 
 
 def _demonstrate(plant: Path, out: Path, console: Console, quiet: bool) -> Mapping[str, object]:
@@ -130,14 +143,15 @@ def _demonstrate(plant: Path, out: Path, console: Console, quiet: bool) -> Mappi
     demonstrated = Demonstrated.read(plant)
     out = out / demonstrated.description.plant.name
     with _bars(console, quiet) as bars:
-        demonstrated.write(out / "plant", _counting(bars, len(demonstrated.mirrors)))
+        counting = _counting(bars, "photograph a plant", len(demonstrated.mirrors))
+        demonstrated.write(out / "plant", counting)
     return run_demo(out / "plant", out, console, quiet)
 
 
-def _counting(bars: Progress, total: int) -> Callable[[str], None]:
-    """Progress of photographs of so many heliostats."""
-    task = bars.add_task("photograph a plant", total=total)
-    return lambda name: bars.update(task, description=f"photograph {name}", advance=1)
+def _counting(bars: Progress, what: str, total: int) -> Callable[[str], None]:
+    """Progress of a part with so many steps."""
+    task = bars.add_task(what, total=total)
+    return lambda name: bars.update(task, description=f"{what}: {name}", advance=1)
 
 
 def run_demo(root: Path, out: Path, console: Console, quiet: bool = False) -> Mapping[str, object]:
@@ -162,25 +176,48 @@ def run_demo(root: Path, out: Path, console: Console, quiet: bool = False) -> Ma
                 runtime, whole, lambda name: bars.update(task, description=name, advance=1)
             )
             made, skipped = _predict_all(runtime, folder, bars)
+            if not made:
+                reasons = list_reasons(skipped)
+                raise ModelError(
+                    f"{root}: no heliostat had an image that could be used ({reasons})"
+                )
+            study = _study(runtime, bars)
         finally:
             runtime.close()
-    if not made:
-        reasons = list_reasons(skipped)
-        raise ModelError(f"{root}: no heliostat had an image that could be used ({reasons})")
     field = _trace_field(root, out)
     results = _drawn(out, made, runtime.settings.figure_scales)
     report: dict[str, object] = {
         "data": str(root),
         "store": imported["counts"],
         "heliostats": [asdict(result) for result in results],
+        "study": study,
         "field": field,
         "skipped": {**skipped, **imported["skipped"]},
     }
     write_json(out / "report.json", report)
     (out / "report.html").write_text(_page(report, results), encoding="utf-8")
     if not quiet:
-        _print(console, results, out, store)
+        _print(console, results, study["conclusion"], out, store)
     return report
+
+
+def _study(runtime: Runtime, bars: Progress) -> dict[str, str | None]:
+    """Study all photographs, store the study, and return its verdict and conclusion.
+
+    Without a verdict, the conclusion says why none was possible.
+    """
+    task = bars.add_task("study what the model lacks", total=1)
+    try:
+        studied = study_store(runtime, StudyRequest())
+    except ConflictError as error:
+        return {"verdict": None, "conclusion": str(error)}
+    row = study_row(
+        studied, "Study of the demonstration", {}, ACTOR, runtime.settings.figure_scales
+    )
+    with runtime.database.writing() as session:
+        store_study(session, row)
+    bars.update(task, advance=1)
+    return {"verdict": row.verdict, "conclusion": row.conclusion}
 
 
 def _trace_field(root: Path, out: Path) -> FieldReport | None:
@@ -236,18 +273,28 @@ class _Made:
 def _predict_all(
     runtime: Runtime, folder: MeasurementFolder, bars: Progress
 ) -> tuple[list[_Made], dict[str, str]]:
-    made, skipped = [], {}
-    task = bars.add_task("predict and forecast", total=len(folder.plant.heliostats))
-    for name in folder.plant.heliostats:
-        bars.update(task, description=f"predict and forecast {name}")
+    """Predict in two threads; results in the order of the heliostats."""
+    done = _counting(bars, "predict and forecast", len(folder.plant.heliostats))
+
+    def predict(name: str) -> _Made | str:
         with runtime.database.reading() as session:
             usable, refused = observations_of(FolderStore(folder, runtime, session), name)
-        if usable:
-            made.append(_predict(runtime, folder, name, usable))
-        else:
-            skipped[name] = next(iter(refused.values()), "no image")
-        bars.update(task, advance=1)
-    return made, skipped
+        result = (
+            _predict(runtime, folder, name, usable)
+            if usable
+            else next(iter(refused.values()), "no image")
+        )
+        done(name)
+        return result
+
+    with ThreadPoolExecutor(2) as pool:
+        found = dict(
+            zip(folder.plant.heliostats, pool.map(predict, folder.plant.heliostats), strict=True)
+        )
+    return (
+        [one for one in found.values() if not isinstance(one, str)],
+        {name: one for name, one in found.items() if isinstance(one, str)},
+    )
 
 
 def _split(observations: list[Observation]) -> tuple[list[Observation], list[Observation]]:
@@ -412,12 +459,15 @@ def _row(result: HeliostatResult) -> tuple[str, ...]:
     return (result.heliostat, images, *map(_cell, figures))
 
 
-def _print(console: Console, results: list[HeliostatResult], out: Path, store: Path) -> None:
+def _print(
+    console: Console, results: list[HeliostatResult], study: str | None, out: Path, store: Path
+) -> None:
     table = make_table("What the surfaces are worth", *COLUMNS)
     table.caption, table.caption_justify = CAPTION, "left"
     for result in results:
         table.add_row(*_row(result))
     console.print(table)
+    console.print(f"study: {study}", highlight=False)
     console.print(f"pictures and report: {out / 'report.html'}", highlight=False)
     _print_next(console, "next, the service on what was made", store)
 
@@ -447,6 +497,7 @@ def _page(report: Mapping[str, object], results: list[HeliostatResult]) -> str:
         accuracies=accuracies,
         photographs=photographs,
         field=report["field"],
+        study=report["study"],
         is_unseen=judging[0].held_out,
         errors_mm=[
             result.error_refined_mm for result in results if result.error_refined_mm is not None

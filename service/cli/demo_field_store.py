@@ -41,13 +41,17 @@ _LIMIT_W_M2 = 4e5  # of the receiver
 
 
 def seed_field(
-    root: Path, store: Path, progress: Progress = no_progress, *, rows: int = ROWS
+    root: Path,
+    store: Path,
+    counting: Callable[[int], Progress] = lambda total: no_progress,
+    *,
+    rows: int = ROWS,
 ) -> None:
     """Write the field's folder ``root`` and fill the ``store``.
 
     Older photographs are imported, and give surfaces and mounts. Newer ones are received one by
     one, as by the service, so each is compared with its forecast. A store that exists is left as it
-    is.
+    is. ``counting`` takes the number of steps, and returns what each of them is reported to.
     """
     if store.exists():
         return
@@ -60,13 +64,15 @@ def seed_field(
     photographs = plan_photographs(plant, now)
     older = [one for one in photographs if one.taken_at < begin]
     newer = [one for one in photographs if one.taken_at >= begin]
+    names = sorted({one.mirror.name for one in older})
+    # Each photograph is written, then imported or received.
+    progress = counting(2 * len(photographs) + len(names))
     runtime = Runtime.from_settings(Settings(data_dir=begun, database_url=None, host="127.0.0.1"))
     try:
         runtime.database.upgrade()
         import_folder(runtime, read_folder(root, [], whole_field=True), actor=ACTOR)
         write_measured_surfaces(root, older)
         write_photographs(root, plant, older, progress)
-        names = sorted({one.mirror.name for one in older})
         _in_threads(
             lambda part: import_folder(runtime, read_folder(root, part), progress, ACTOR), names
         )

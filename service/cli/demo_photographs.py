@@ -80,6 +80,21 @@ class Camera:
         declination = np.copysign(np.linspace(0, 22, count), self.latitude)
         return sun_direction_at(rng.permutation(declination), hour_angle, self.latitude)
 
+    def skip(self, count: int, rng: np.random.Generator) -> None:
+        """Draw from the generator what `photograph` draws, to photograph another mirror at the same
+        time.
+        """
+        self.suns(count, rng)
+        rng.uniform(-0.6, 0.6, (count, 2))
+        rng.integers(2**31)
+        options = self._options
+        for _ in range(count):
+            rng.normal(0, options.noise, (*options.size, 3))
+
+    @property
+    def _options(self) -> CameraOptions:
+        return CameraOptions() if self.marks else UNMARKED
+
     def photograph(
         self, mirror: Heliostat, z: Array, count: int, rng: np.random.Generator
     ) -> Photographs:
@@ -107,10 +122,7 @@ class Camera:
                 flux,
                 self.target,
                 rng,
-                replace(
-                    CameraOptions() if self.marks else UNMARKED,
-                    time_stamp=f"demo {mirror.name} image {index + 1}",
-                ),
+                replace(self._options, time_stamp=f"demo {mirror.name} image {index + 1}"),
             )
             for index, flux in enumerate(traced)
         ]

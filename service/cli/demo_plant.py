@@ -3,6 +3,8 @@
 The true mirror surfaces are drawn from the surface prior.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,7 +18,15 @@ from model.plant import Heliostat, Plant, TargetPlane
 from model.prior import default_prior
 from model.tracing import Optics
 from service.base.progress import Progress, no_progress
-from service.cli.demo_photographs import DEVIATION, IMAGES, RAYS, Camera, write_frame, write_surface
+from service.cli.demo_photographs import (
+    DEVIATION,
+    IMAGES,
+    RAYS,
+    Camera,
+    Photographs,
+    write_frame,
+    write_surface,
+)
 from service.cli.folder import write_json
 from service.sources.paint_documents import azimuth_from_south
 
@@ -123,35 +133,45 @@ def write_plant(
     plant, prior = Plant("demo", ORIGIN), default_prior()
     camera = Camera(TARGET, float(ORIGIN[0]), Optics(), rays)
     write_json(root / "demo-tower-measurements.json", tower(plant))
-    for number, (name, position) in enumerate(POSITIONS.items(), start=1):
-        progress(name)
-        mirror = Heliostat.juelich(
-            name,
-            position,
-            float(np.linalg.norm(position - TARGET.center)),
-            mount=Mount.juelich(DRIVES),
-        )
-        z = prior.surface(rng.normal(0, DEVIATION, len(prior.basis)))
-        write_json(
-            root / name / "Properties" / f"{name}-heliostat-properties.json",
-            properties(mirror, plant),
-        )
-        write_surface(root, mirror, z)
-        taken = camera.photograph(mirror, z, images, rng)
-        assert taken.motors is not None  # its mounts have drives
-        for index, (sun, motors, frame) in enumerate(
-            zip(taken.suns, taken.motors, taken.frames, strict=True), start=1
-        ):
-            azimuth, elevation = sun_angles(sun)
-            stem = root / name / "Calibration" / f"{number}{index:02d}"
-            about = {
-                "target_name": TARGET.name,
-                "sun_azimuth": azimuth_from_south(float(azimuth)),
-                "sun_elevation": float(elevation),
-                "motor_position": {
-                    f"axis_{axis}_motor_position": round(float(steps))
-                    for axis, steps in zip((1, 2), motors, strict=True)
-                },
-            }
-            write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
-            write_frame(stem.with_name(f"{stem.name}-raw.png"), frame)
+
+    def take(number: int, mirror: Heliostat, z: Array, draws: np.random.Generator) -> None:
+        taken = camera.photograph(mirror, z, images, draws)
+        _write_photographs(root, number, mirror.name, taken)
+        progress(mirror.name)
+
+    with ThreadPoolExecutor(2) as pool:
+        written = []
+        for number, (name, position) in enumerate(POSITIONS.items(), start=1):
+            distance = float(np.linalg.norm(position - TARGET.center))
+            mirror = Heliostat.juelich(name, position, distance, mount=Mount.juelich(DRIVES))
+            z = prior.surface(rng.normal(0, DEVIATION, len(prior.basis)))
+            write_json(
+                root / name / "Properties" / f"{name}-heliostat-properties.json",
+                properties(mirror, plant),
+            )
+            write_surface(root, mirror, z)
+            written.append(pool.submit(take, number, mirror, z, deepcopy(rng)))
+            camera.skip(images, rng)
+        for one in written:
+            one.result()
+
+
+def _write_photographs(root: Path, number: int, name: str, taken: Photographs) -> None:
+    """Write the photographs of a mirror, with their properties."""
+    assert taken.motors is not None  # its mounts have drives
+    for index, (sun, motors, frame) in enumerate(
+        zip(taken.suns, taken.motors, taken.frames, strict=True), start=1
+    ):
+        azimuth, elevation = sun_angles(sun)
+        stem = root / name / "Calibration" / f"{number}{index:02d}"
+        about = {
+            "target_name": TARGET.name,
+            "sun_azimuth": azimuth_from_south(float(azimuth)),
+            "sun_elevation": float(elevation),
+            "motor_position": {
+                f"axis_{axis}_motor_position": round(float(steps))
+                for axis, steps in zip((1, 2), motors, strict=True)
+            },
+        }
+        write_json(stem.with_name(f"{stem.name}-calibration-properties.json"), about)
+        write_frame(stem.with_name(f"{stem.name}-raw.png"), frame)

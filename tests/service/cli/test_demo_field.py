@@ -1,6 +1,6 @@
 """The demonstration's field: each fault that it is made with is found."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from statistics import median
@@ -27,9 +27,18 @@ ROWS = 4
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A client on the store of a small field; it only reads."""
-    made = made_once(
-        tmp_path_factory, "field", lambda root: seed_field(root / "plant", root / "data", rows=ROWS)
-    )
+
+    def make(root: Path) -> None:
+        totals, steps = [], []
+
+        def counting(total: int) -> Callable[[str], None]:
+            totals.append(total)
+            return steps.append
+
+        seed_field(root / "plant", root / "data", counting, rows=ROWS)
+        assert totals == [len(steps)]  # a bar ends where it says
+
+    made = made_once(tmp_path_factory, "field", make)
     with client_on(made) as client:
         yield client
 

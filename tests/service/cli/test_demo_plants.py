@@ -1,11 +1,23 @@
 """``heliotwin demo --plant``: photographs of any plant, and the embedded plant that is another."""
 
 import json
+from collections.abc import Mapping
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from rich.console import Console
 
+from model.mount import Mount
+from model.plant import Heliostat
+from model.prior import default_prior
+from model.tracing import Optics
+from service.cli import demo
 from service.cli.demo_described import Demonstrated, write_southern_plant
+from service.cli.demo_photographs import Camera
+from service.cli.demo_plant import DRIVES, POSITIONS, TARGET
 from service.sources.folder import read_folder
 from service.sources.plant_template import template_text
 from tests.service.command import ends, heliotwin
@@ -78,3 +90,40 @@ def test_a_plant_that_cannot_be_photographed_says_why(
 def test_data_and_plant_are_not_both_given(tmp_path: Path):
     done = heliotwin("demo", "--plant", write_small(tmp_path), "--data", tmp_path)
     ends(done, 2, "--data, --plant: give one of them")
+
+
+def test_photographs_of_two_mirrors_at_once_are_those_of_one_after_the_other():
+    """`Camera.skip` draws what a mirror's photographs draw."""
+    camera = Camera(TARGET, 50.9, Optics(), rays=1000)
+    place = np.array(POSITIONS["AB12"])
+    mirror = Heliostat.juelich("AB12", place, 80.0, mount=Mount.juelich(DRIVES))
+    taken, skipped = np.random.default_rng(1), np.random.default_rng(1)
+    camera.photograph(mirror, default_prior().mean, 2, taken)
+    camera.skip(2, skipped)
+    assert taken.bit_generator.state == skipped.bit_generator.state
+
+
+def test_each_part_is_announced_with_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made: list[str] = []
+
+    def run_demo(root: Path, *_: object) -> Mapping[str, object]:
+        made.append(root.parent.name)
+        return {}
+
+    def seed_field(root: Path, store: Path, counting: Any) -> None:
+        step = counting(2)
+        step("A")
+        step("B")
+
+    monkeypatch.setattr(demo, "write_plant", lambda root, progress: None)
+    monkeypatch.setattr(demo, "run_demo", run_demo)
+    monkeypatch.setattr(demo, "_demonstrate", lambda *_: run_demo(tmp_path / "southern" / "plant"))
+    monkeypatch.setattr(demo, "seed_field", seed_field)
+    said = StringIO()
+    demo.run_demos(None, None, tmp_path / "out", Console(file=said, width=100))
+    parts = [line for line in said.getvalue().splitlines() if " of 3: " in line]
+    assert [part[:7] for part in parts] == ["1 of 3:", "2 of 3:", "3 of 3:"]
+    assert all("minute" in part for part in parts)
+    assert made == ["out", "southern"]
+    assert "2/2" in said.getvalue()
+    assert "None" not in said.getvalue()

@@ -356,6 +356,8 @@ def test_demo_leaves_table_pictures_report_and_store(tmp_path, stj, pair_plant):
         for picture in entry["pictures"]:
             assert (tmp_path / "demo" / picture).read_bytes().startswith(b"\x89PNG")
     assert "heliotwin serve" in done.stderr
+    assert report["study"]["verdict"] in ("effect", "none", "unexplained")
+    assert report["study"]["conclusion"] in " ".join(done.stderr.split())
     page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
     assert '<meta name="viewport"' in page
     assert "forecasts with refined surfaces are" in page
