@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from fastapi.testclient import TestClient
@@ -28,7 +29,9 @@ from service.sources.documents import read_targets
 from service.store.columns import now
 from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow
-from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
+from service.twin.alarms import field_overview
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from tests.faults.harness import new_store
 from tests.service.conftest import (
@@ -159,8 +162,8 @@ def _surface(rng: np.random.Generator, number: int, version: int, at: Any) -> di
     }
 
 
-def _drawn_rank(_: AccuracyCache, state: AccuracyState) -> Rank:
-    return Rank(0.8 + 0.2 * (state.surface * 7919 % 1000) / 1000, 3)
+def _drawn_rank(_: Runtime, heliostat: str) -> Rank:
+    return Rank(0.8 + 0.2 * (crc32(heliostat.encode()) % 1000) / 1000, 3)
 
 
 def _timed(client: TestClient, path: str) -> tuple[float, Any]:
@@ -214,9 +217,9 @@ def main() -> None:
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--heliostats", type=int, default=20_000)
     options = parser.parse_args()
-    AccuracyCache._rank = _drawn_rank  # type: ignore[method-assign]
+    field_overview.rank_of_active = _drawn_rank
     with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as made:
-        settings = made.settings.model_copy(update=QUIET)
+        settings = made.settings.model_copy(update=QUIET | {"job_workers": 1})
         database = Database(settings.database)
         database.upgrade()
         fill(database, options.heliostats)

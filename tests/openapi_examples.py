@@ -26,6 +26,7 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.paint_documents import azimuth_from_north
 from service.store import keys
+from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app
 from tests.service.archives import zipped
 
@@ -329,6 +330,9 @@ def administrate(record: Recorder, key: str) -> None:
     record.call("get_job_events", f"GET {path}/events", 204, headers=last)
     waiting = record.call("post_predictions_job", "POST /v1/jobs/predictions", 202, json={})
     record.call("cancel_job", f"POST /v1/jobs/{waiting['id']}/cancel")
+    writer = FieldStateWriter(record.client.app.state.runtime)  # type: ignore[attr-defined]
+    while writer.update():
+        pass
     alarms = record.call("list_alarms", "GET /v1/alarms")["items"]
     ids = {"ids": [alarms[0]["id"]], "reason": "the camera is being repaired"}
     record.call("post_acknowledgements", "POST /v1/alarms/acknowledgements", json=ids)

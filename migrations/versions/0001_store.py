@@ -10,7 +10,7 @@ from alembic import op
 from service.store import job_tables, tables  # noqa: F401 - the metadata knows what was loaded
 from service.store.columns import Base
 
-revision = "a91e1ff0e870"
+revision = "ecd320ec17aa"
 down_revision = None
 branch_labels = None
 depends_on = None

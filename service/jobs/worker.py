@@ -31,6 +31,7 @@ from service.jobs.uploads import delete_unused_uploads
 from service.store import record_retention
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
+from service.twin.alarms.field_updates import FieldStateWriter
 from service.twin.runtime.runtime import Operations, Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
@@ -263,6 +264,8 @@ class Worker:
 class Workers:
     """Worker threads of this process, with additional ones for short jobs only.
 
+    Another thread writes the state of the field (`FieldStateWriter`).
+
     A thread that hangs cannot be stopped. ``on_stuck`` handles this case. Without it, another
     thread takes over the worker and its computation slots. The stuck thread keeps its memory and
     other resources until the process ends.
@@ -281,11 +284,16 @@ class Workers:
         self._numbers = itertools.count()
         self._threads: dict[int, threading.Thread] = {}
         self._changing = threading.Lock()
+        self._state: threading.Thread | None = None
 
     def start(self) -> None:
         """Start to take jobs."""
         for only_short in self._lanes:
             self._start_one(only_short)
+        if self._lanes:
+            run = partial(FieldStateWriter(self._runtime).run, self.stopping)
+            self._state = threading.Thread(target=run, name="field-state", daemon=True)
+            self._state.start()
 
     def _start_one(self, only_short: bool) -> None:
         """Start a thread, unless the workers are stopping. `stop` waits for each started thread."""
@@ -329,7 +337,7 @@ class Workers:
         self.stopping.set()
         self._runtime.job_came.release(max(1, len(self._lanes)))  # wakes idle workers
         with self._changing:  # no thread starts after this
-            threads = list(self._threads.values())
+            threads = [*self._threads.values(), *([self._state] if self._state else [])]
         until = time.monotonic() + _GRACE_S
         for thread in threads:
             thread.join(max(0.0, until - time.monotonic()))

@@ -1,19 +1,19 @@
 """Storage of acknowledged alarms, and of the history of alarms."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session, load_only
 
 from service.base.errors import ConflictError, NotFoundError
 from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, AlarmRow
-from service.store.rows import serialize_writers
+from service.store.rows import assign, serialize_writers
 from service.store.tables import HeliostatRow
 
 
@@ -185,30 +185,81 @@ def newest_batch(session: Session, heliostat: str, reason: str) -> Acknowledgeme
 # --------------------------------------------------------------------------------------------------
 
 
-def open_alarms(session: Session) -> dict[Key, AlarmRow]:
-    """Return the alarms that are recorded as present."""
-    rows = session.execute(_alarms().where(AlarmRow.closed_at.is_(None)))
-    return {_key(name, row): row for name, row in rows}
+class OpenAlarm(NamedTuple):
+    """An alarm that is present, with the heliostat's name and its acknowledgement."""
+
+    heliostat: str | None
+    row: AlarmRow
+    acknowledgement: AcknowledgementRow | None
 
 
-def record_alarms(session: Session, present: Mapping[Key, tuple[str, datetime]]) -> None:
-    """Record which alarms are present, each with its message and since when.
+def _open(*columns: Any) -> Select[Any]:
+    """Query present alarms with their acknowledgements."""
+    made, row = AcknowledgementRow, AlarmRow
+    is_of_row = (
+        (made.fingerprint == row.fingerprint)
+        & (made.reason == row.reason)
+        & made.heliostat_id.is_not_distinct_from(row.heliostat_id)
+        & made.undone_at.is_(None)
+    )
+    query = select(*columns).select_from(row).outerjoin(made, is_of_row)
+    return query.where(row.ended_at.is_(None))
 
-    Recorded ones that are not present are closed.
+
+def open_alarms(session: Session) -> list[OpenAlarm]:
+    """Return the alarms that are present."""
+    query = _open(HeliostatRow.name, AlarmRow, AcknowledgementRow)
+    query = query.outerjoin(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
+    return [OpenAlarm(*found) for found in session.execute(query)]
+
+
+def count_unacknowledged(session: Session) -> dict[str, int]:
+    """The number of present alarms that are not acknowledged, by reason."""
+    query = _open(AlarmRow.reason, func.count()).where(AcknowledgementRow.id.is_(None))
+    return {row[0]: row[1] for row in session.execute(query.group_by(AlarmRow.reason))}
+
+
+def record_alarms(
+    session: Session,
+    present: Mapping[Key, Mapping[str, object]],
+    ended_at: Callable[[Key, AlarmRow], datetime | None],
+) -> set[Key]:
+    """Record which alarms are present, each with its columns; return the new ones.
+
+    A recorded one that is not present ends at ``ended_at``, and remains if that is None.
     """
     serialize_writers(session)
-    held, ids = open_alarms(session), _heliostat_ids(session)
+    held = {_key(name, row): row for name, row, _ in open_alarms(session)}
+    ids = _heliostat_ids(session)
     for key in held.keys() - present.keys():
-        held[key].closed_at = now()
-    for key, (message, since) in present.items():
-        if key not in held and (key.heliostat is None or key.heliostat in ids):
+        held[key].ended_at = ended_at(key, held[key])
+    new = {
+        key: AlarmRow(
+            heliostat_id=_heliostat_id(ids, key),
+            reason=key.reason,
+            fingerprint=key.fingerprint,
+            **columns,
+        )
+        for key, columns in present.items()
+        if key not in held and (key.heliostat is None or key.heliostat in ids)
+    }
+    session.add_all(new.values())
+    for key in held.keys() & present.keys():
+        assign(held[key], dict(present[key]))
+    return set(new)
+
+
+def record_ended(session: Session, ended: Iterable[tuple[Key, Mapping[str, object]]]) -> None:
+    """Record alarms that ended before anybody could see them, each once."""
+    ids = _heliostat_ids(session)
+    for key, columns in ended:
+        number, row = ids.get(key.heliostat or ""), AlarmRow
+        is_known = (row.heliostat_id == number) & (row.reason == key.reason)
+        known = select(row.id).where(is_known, row.since == columns["since"])
+        if number is not None and session.scalar(known.limit(1)) is None:
             session.add(
                 AlarmRow(
-                    heliostat_id=_heliostat_id(ids, key),
-                    reason=key.reason,
-                    fingerprint=key.fingerprint,
-                    message=message,
-                    since=since,
+                    heliostat_id=number, reason=key.reason, fingerprint=key.fingerprint, **columns
                 )
             )
 

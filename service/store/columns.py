@@ -66,6 +66,7 @@ class Base(DeclarativeBase):
         dict[str, list[float]]: _Json,
         dict[str, str]: _Json,
         list[dict[str, Any]]: _Json,
+        list[dict[str, object]]: _Json,
         list[float]: _Json,
         list[list[float]]: _Json,
         list[int]: _Json,

@@ -130,9 +130,11 @@ class AcknowledgementRow(Base):
 
 
 class AlarmRow(Base):
-    """An alarm of a heliostat or of the plant, from when it was first seen until it was gone.
+    """An alarm of a heliostat or of the plant, from its beginning to its end.
 
-    ``since`` is when its reason began, which may be long before ``opened_at``.
+    ``since`` and ``ended_at`` are times of the data; ``ended_at`` is None while it is present.
+    ``recorded_at`` is when a worker first wrote it. ``measurements`` are identifiers of the
+    heliostat's measurements to look at.
     """
 
     __tablename__ = "alarms"
@@ -142,9 +144,11 @@ class AlarmRow(Base):
     reason: Mapped[str] = mapped_column(String(32))
     fingerprint: Mapped[str] = mapped_column(String(96))
     message: Mapped[str] = mapped_column(Text)
+    action: Mapped[str] = mapped_column(Text)
+    measurements: Mapped[list[str]]
     since: Mapped[datetime]
-    opened_at: Mapped[datetime] = mapped_column(default=now)
-    closed_at: Mapped[datetime | None] = mapped_column(index=True)
+    recorded_at: Mapped[datetime] = mapped_column(default=now)
+    ended_at: Mapped[datetime | None] = mapped_column(index=True)
 
 
 class AuditRow(Base):

@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from service.base.fields import JsonObject, Sun
-from service.store.columns import Base, now, one_of
+from service.store.columns import EPOCH, Base, now, one_of
 
 NO_IMAGE = "none"
 """Kind of a measurement without an image: motor positions and a focal spot."""
@@ -425,6 +425,55 @@ class DriftRow(Base):
     earlier: Mapped[float | None]
     min_drop: Mapped[float | None]
     fell_since: Mapped[datetime | None]
+
+
+class HeliostatStateRow(Base):
+    """Results of a heliostat that take long to compute, and the keys of what they are based on.
+
+    A result is valid as long as its key is that of the data (`service.twin.alarms.field_overview`).
+
+    - ``surface_id`` is the surface of ``deviation_mm`` and ``uncertainty_mm``.
+    - ``accuracy`` is the mean over ``held_out`` photographs [1]; None if there are none.
+    - ``pointing`` is a `service.twin.pointing.errors.PointingState`.
+    """
+
+    __tablename__ = "heliostat_state"
+
+    heliostat_id: Mapped[int] = mapped_column(
+        ForeignKey("heliostats.id"), primary_key=True, autoincrement=False
+    )
+    computed_at: Mapped[datetime] = mapped_column(default=now)
+    surface_id: Mapped[int | None]
+    deviation_mm: Mapped[float | None]
+    uncertainty_mm: Mapped[float | None]
+    accuracy_key: Mapped[str | None] = mapped_column(String(200))
+    accuracy: Mapped[float | None]
+    held_out: Mapped[int | None]
+    pointing_key: Mapped[str | None] = mapped_column(String(200))
+    pointing: Mapped[dict[str, object] | None]
+
+
+class FieldStateRow(Base):
+    """When the alarms were computed, and from what: a single row.
+
+    - ``revision`` counts writes of alarms, and ``states`` those of `HeliostatStateRow`.
+    - ``marks`` are the newest rows behind the alarms (`service.twin.alarms.field_overview`).
+    - ``pending`` heliostats had no valid results then.
+    - ``cameras`` are `service.twin.studies.camera_watch.CameraChange`.
+    - ``pointing_limit_mrad`` is the limit of the settings behind the pointing of all heliostats.
+    """
+
+    __tablename__ = "field_state"
+    __table_args__ = (CheckConstraint("id = 1", name="single"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False, default=1)
+    revision: Mapped[int] = mapped_column(default=0)
+    states: Mapped[int] = mapped_column(default=0)
+    computed_at: Mapped[datetime] = mapped_column(default=EPOCH)
+    marks: Mapped[str] = mapped_column(Text, default="")
+    pending: Mapped[int] = mapped_column(default=0)
+    cameras: Mapped[list[dict[str, object]]] = mapped_column(default=list)
+    pointing_limit_mrad: Mapped[float | None]
 
 
 class ForecastRow(Base):

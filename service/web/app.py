@@ -113,7 +113,7 @@ def create_app(
             await to_thread.run_sync(delete_unused_uploads, runtime)
             app.state.runtime = runtime.for_requests()
             app.state.field = FieldOverviewCache(runtime)
-            app.state.alarms = AlarmCount(runtime, app.state.field)
+            app.state.alarms = AlarmCount()
             app.state.watchers = Watchers(runtime)
             app.state.comparisons = ComparisonCache(runtime)
             workers = Workers(runtime, kinds, settings.job_workers)
@@ -123,7 +123,6 @@ def create_app(
                     yield
             finally:
                 await to_thread.run_sync(workers.stop)
-                await to_thread.run_sync(app.state.alarms.close)
                 await to_thread.run_sync(app.state.field.close)
                 await to_thread.run_sync(app.state.comparisons.close)
         finally:

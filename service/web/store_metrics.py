@@ -19,16 +19,15 @@ from sqlalchemy.orm import Session
 
 from service.base.metrics import PROCESS
 from service.base.settings import Settings
-from service.store import sizes
+from service.store import field_state, sizes
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
-from service.twin.alarms.acknowledging import record_history
-from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.reasons import REASONS
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CameraChange
+from service.twin.studies.camera_watch import CHANGES, CameraChange
 
 _VERDICTS = {True: "yes", False: "no", None: "unknown"}
 
@@ -49,19 +48,18 @@ class StoreCollector(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Query the metrics in one transaction, and record which alarms came and went."""
+        """Query the metrics in one transaction."""
         try:
             with self._runtime.database.reading() as session:
-                found = [*_queue(session), *_sizes(session, self._runtime.settings)]
-                alarms = find_alarms(session, self._cache, self._runtime.settings)
-                found.append(_alarms(alarms.alarms))
-                cameras = self._cache.cameras.read(session, self._runtime.settings)
-                found.append(_cameras(cameras.changes))
+                found = [_alarms(read_alarms(session).alarms)]
+                found += [*_queue(session), *_sizes(session, self._runtime.settings)]
+                found.append(
+                    _cameras(CHANGES.validate_python(field_state.read_field_state(session).cameras))
+                )
                 found += self._cache.recent(
                     session, "metrics", partial(self._of_heliostats, session)
                 )
                 found.append(_drift(session, self._runtime.settings.metrics_heliostats))
-            record_history(self._runtime, alarms)
         except SQLAlchemyError as error:
             logger.warning("metrics of the store are missing: %s", error)
             found = []

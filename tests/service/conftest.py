@@ -23,6 +23,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from sqlalchemy import URL, make_url
+from sqlalchemy.orm import Session
 from starlette.routing import BaseRoute
 
 from model.errors import UnreachableError
@@ -38,9 +39,12 @@ from model.surface import control_points
 from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.sources.paint_documents import azimuth_from_north
+from service.store import acknowledgements, field_state
 from service.store.columns import Base
 from service.store.database import Database
+from service.twin.alarms.field_updates import FieldStateWriter
 from service.twin.runtime.operations import Forecast
+from service.twin.runtime.runtime import Runtime
 from service.web import app as web_app
 from service.web.app import create_app
 from tests.conftest import made_once
@@ -141,6 +145,53 @@ def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Database, "upgrade", copy_or_upgrade)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def written_state() -> Iterator[None]:
+    """Where no workers run, the state of the field is written just before it is read."""
+    writers: dict[str, FieldStateWriter] = {}
+    writing = threading.RLock()
+    make, close = Runtime.from_settings, Runtime.close
+
+    def make_and_register(settings: Settings, *arguments: Any) -> Runtime:
+        runtime = make(settings, *arguments)
+        if not settings.job_workers:
+            writers[str(runtime.database.url)] = FieldStateWriter(runtime)
+        return runtime
+
+    def close_and_forget(runtime: Runtime) -> None:
+        writers.pop(str(runtime.database.url), None)
+        close(runtime)
+
+    def written_first(read: Callable[..., Any]) -> Callable[..., Any]:
+        def write_and_read(session: Session, *arguments: Any) -> Any:
+            url = str(session.get_bind().engine.url)
+            with writing:
+                writer = writers.pop(url, None)  # it reads, too
+                if writer is not None:
+                    write_state(writer)
+                    writers[url] = writer
+            return read(session, *arguments)
+
+        return write_and_read
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runtime, "from_settings", make_and_register)
+        patch.setattr(Runtime, "close", close_and_forget)
+        for module, name in (
+            (field_state, "read_field_state"),
+            (acknowledgements, "count_unacknowledged"),
+            (acknowledgements, "list_history"),
+        ):
+            patch.setattr(module, name, written_first(getattr(module, name)))
+        yield
+
+
+def write_state(writer: FieldStateWriter) -> None:
+    """Write all that is pending; of a large field only if something was stored."""
+    while (writer.is_due() or not writer.is_large) and writer.update():
+        pass
 
 
 # --- databases

@@ -14,6 +14,7 @@ from service.store.tables import (
     DriftRow,
     ForecastRow,
     HeliostatRow,
+    HeliostatStateRow,
     MeasurementRow,
     MountRow,
     ReceiverRow,
@@ -62,7 +63,7 @@ def remove_heliostat(session: Session, name: str) -> None:
     # A study refers to names, because its photographs may be deleted before the study.
     studied = sum(name in heliostats for heliostats in session.scalars(select(StudyRow.heliostats)))
     # The history of alarms does not prevent removal. If the removal fails, it is restored.
-    for table in (AcknowledgementRow, AlarmRow):
+    for table in (AcknowledgementRow, AlarmRow, HeliostatStateRow):
         session.execute(delete(table).where(table.heliostat_id == row.id))
     _delete_unused(session, row, f"heliostat {name}", {**users, "studies": studied})
 

@@ -1,4 +1,4 @@
-"""Acknowledging alarms together, undoing that, and recording their history."""
+"""Acknowledging alarms together, and undoing that."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -10,11 +10,11 @@ from sqlalchemy.orm import Session
 from service import store
 from service.base.errors import ConflictError, NotFoundError
 from service.store import acknowledgements
-from service.store.acknowledgements import AlarmHistory
+from service.store.columns import now
 from service.store.surfaces import decisions
 from service.store.tables import HeliostatRow, SurfaceRow
-from service.twin.alarms.alarms import Alarm, AlarmList, find_alarms
-from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.alarms import Alarm, AlarmList, find_untrusted
+from service.twin.alarms.field_overview import read_summaries
 from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.runtime.runtime import Runtime
 
@@ -109,7 +109,6 @@ def acknowledge(
         raise NotFoundError(
             f"ids: {missing[0]} is not an alarm, or its reason changed; see /v1/alarms"
         )
-    record_history(runtime, found)
     chosen = [items[number] for number in ids]
     with runtime.database.writing() as session:
         rows = acknowledgements.acknowledge(session, [item.key for item in chosen], actor, comment)
@@ -122,7 +121,7 @@ def acknowledge(
 
 
 def acknowledge_surface(
-    runtime: Runtime, cache: FieldOverviewCache, name: str, version: int, actor: str, comment: str
+    runtime: Runtime, name: str, version: int, actor: str, comment: str
 ) -> None:
     """Acknowledge the alarm that a heliostat's surface is not trusted.
 
@@ -131,18 +130,18 @@ def acknowledge_surface(
     ConflictError
         If there is no such alarm, or it is about another version.
     """
-    with runtime.database.reading() as session:
+    with runtime.database.writing() as session:
         heliostat = store.get_heliostat(session, name)
         surface = store.get_surface(session, heliostat, version)
-        found = find_alarms(session, cache, runtime.settings)
-        is_shown = _flagged_surface(session, heliostat).id == surface.id
-    alarms = AlarmFilter("untrusted", heliostat=name).choose(found.alarms)
-    if not (alarms and is_shown):
-        raise ConflictError(
-            f"heliostat {name}: surface {version} has no warnings to acknowledge; only those of"
-            " the active surface can be acknowledged"
-        )
-    acknowledge(runtime, found, [alarm.id for alarm in alarms], actor, comment)
+        (line,) = read_summaries(session, heliostat.id)
+        alarm = find_untrusted(line, now())
+        if alarm is None or _flagged_surface(session, heliostat).id != surface.id:
+            raise ConflictError(
+                f"heliostat {name}: surface {version} has no warnings to acknowledge; only those"
+                " of the active surface can be acknowledged"
+            )
+        acknowledgements.acknowledge(session, [alarm.key], actor, comment)
+        decisions.acknowledge_warnings(session, heliostat, surface, actor)
 
 
 def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:
@@ -159,31 +158,3 @@ def _flagged_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow:
     """The surface that the alarm "untrusted" is about."""
     candidate = store.find_candidate(session, heliostat)
     return candidate or store.get_surface_at(session, heliostat)
-
-
-def record_history(runtime: Runtime, found: AlarmList) -> None:
-    """Record which alarms came and went. Nothing is recorded while results are pending."""
-    present = {item.key: (item.message, item.since) for item in found.alarms}
-    with runtime.database.reading() as session:
-        is_known = acknowledgements.open_alarms(session).keys() == present.keys()
-    if not (is_known or found.pending):
-        with runtime.database.writing() as session:
-            acknowledgements.record_alarms(session, present)
-
-
-def read_history(
-    runtime: Runtime,
-    cache: FieldOverviewCache,
-    limit: int,
-    after: int | None = None,
-    wanted: AlarmFilter = AlarmFilter(),
-) -> list[AlarmHistory]:
-    """Up to ``limit`` alarms that are or were present, older than record ``after``.
-
-    What came or went since the last record is recorded first.
-    """
-    with runtime.database.reading() as session:
-        found = find_alarms(session, cache, runtime.settings)
-    record_history(runtime, found)
-    with runtime.database.reading() as session:
-        return acknowledgements.list_history(session, limit, after, wanted.reason, wanted.heliostat)

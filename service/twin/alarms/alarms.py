@@ -1,19 +1,20 @@
 """Alarms: what an operator should look at, since when, and what to do.
 
-All alarms are computed from the store and the field overview when they are read. Only
-acknowledgements are stored. Each alarm has a ``fingerprint``, and an acknowledgement is valid as
+Workers compute all alarms from the store and write them (`service.twin.alarms.field_updates`).
+Readers read what was written. Each alarm has a ``fingerprint``, and an acknowledgement is valid as
 long as the fingerprint is the same. The fingerprint changes when the reason disappears and returns,
 or when its measured value doubles.
 """
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from datetime import time as clock
-from itertools import pairwise
-from typing import NamedTuple
+from itertools import groupby, pairwise
+from operator import itemgetter
+from typing import NamedTuple, cast
 from zoneinfo import ZoneInfo
 
 from sqlalchemy import ColumnElement, case, func, or_, select
@@ -23,9 +24,9 @@ from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
 from model.times import format_minute
 from service.base.settings import Settings
-from service.store import acknowledgements
+from service.store import acknowledgements, field_state
 from service.store.columns import now
-from service.store.job_tables import AcknowledgementRow, JobRow
+from service.store.job_tables import AcknowledgementRow, AlarmRow, JobRow
 from service.store.jobs import queue
 from service.store.photographs.measurements import EXCLUDED, has_warning
 from service.store.tables import (
@@ -39,18 +40,13 @@ from service.store.tables import (
     PlantRow,
     StudyRow,
 )
-from service.twin.alarms.field_overview import (
-    PATIENCE_S,
-    ActiveSurface,
-    FieldOverviewCache,
-    HeliostatOverview,
-)
+from service.twin.alarms.field_overview import HeliostatOverview, read_marks
 from service.twin.alarms.light import LostLight, find_lost_light
 from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
-from service.twin.studies.camera_watch import FIGURES, CameraChange
+from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
 
 
 @dataclass(frozen=True)
@@ -101,57 +97,68 @@ class Alarm:
 
 
 class AlarmList(NamedTuple):
-    """Alarms, and the number of heliostats with pending results."""
+    """Alarms, when they were computed, and the number of heliostats with pending results.
+
+    The number is at least 1 if something was stored since.
+    """
 
     alarms: list[Alarm]
+    computed_at: datetime
     pending: int
 
 
-def find_alarms(session: Session, cache: FieldOverviewCache, settings: Settings) -> AlarmList:
-    """List all alarms, sorted by urgency of the reason, then by time with the newest first."""
+def read_alarms(session: Session) -> AlarmList:
+    """Read all alarms, sorted by urgency of the reason, then by time with the newest first."""
+    field = field_state.read_field_state(session)
+    alarms = [_stored_alarm(*found) for found in acknowledgements.open_alarms(session)]
+    order = {reason: place for place, reason in enumerate(REASONS)}
+    alarms.sort(
+        key=lambda item: (order[item.reason], -item.since.timestamp(), item.heliostat or "")
+    )
+    pending = max(field.pending, int(field.marks != read_marks(session)))
+    return AlarmList(alarms, field.computed_at, pending)
 
-    def read_alarms() -> AlarmList:
-        field, cameras = cache.read(session, PATIENCE_S), cache.cameras.read(session, settings)
-        lost = find_lost_light(cameras.light, settings.alarm_light_loss)
-        alarms = alarms_of_heliostats(session, field.lines, settings, cameras.changes, lost)
-        return AlarmList(alarms, field.pending)
 
-    return cache.recent(session, "alarms", read_alarms)
+def _stored_alarm(
+    heliostat: str | None, row: AlarmRow, acknowledgement: AcknowledgementRow | None
+) -> Alarm:
+    alarm = Alarm(
+        cast(Reason, row.reason),
+        heliostat,
+        row.since,
+        row.message,
+        row.action,
+        row.fingerprint,
+        measurements=tuple(row.measurements),
+    )
+    return alarm if acknowledgement is None else alarm.with_acknowledgement(acknowledgement)
 
 
-def alarms_of_heliostats(
+def compute_alarms(
     session: Session,
     lines: Sequence[HeliostatOverview],
     settings: Settings,
-    cameras: Sequence[CameraChange],
-    lost_light: Sequence[LostLight] = (),
+    cameras: CameraReadings,
 ) -> list[Alarm]:
-    """List the alarms of the plant, its cameras and its heliostats.
+    """Compute the alarms of the plant, its cameras and its heliostats.
 
-    ``lines`` include the pointing errors.
+    They are acknowledged only as surfaces are.
     """
-    at = now()
+    at, zone = now(), plant_time_zone(session, settings.time_zone)
+    lost = find_lost_light(cameras.light, settings.alarm_light_loss)
     found = [
         *_queue(session, settings),
         *_outdated_aims(session, settings),
         *_camera(session),
-        *_watch_cameras(session, cameras, plant_time_zone(session, settings.time_zone)),
+        *_watch_cameras(session, cameras.changes, zone),
         *_clock(session),
     ]
     found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
-    found += [*_warned(session), *_dimmed(session, lost_light, settings)]
+    found += [*_warned(session), *_dimmed(session, lost, settings)]
     for line in lines:
         found += _of_heliostat(line, settings, at)
-    known = acknowledgements.acknowledged(session)
-    order = {reason: place for place, reason in enumerate(REASONS)}
-    items = [
-        item if (row := known.get(item.key)) is None else item.with_acknowledgement(row)
-        for item in found
-    ]
-    return sorted(
-        items, key=lambda item: (order[item.reason], -item.since.timestamp(), item.heliostat or "")
-    )
+    return found
 
 
 # --- heliostats
@@ -159,20 +166,23 @@ def alarms_of_heliostats(
 
 
 def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alarm]:
-    surface = line.surface or line.candidate
-    if surface is not None and surface.warnings:
-        yield _untrusted_surfaces(line.name, surface, at)
+    if (untrusted := find_untrusted(line, at)) is not None:
+        yield untrusted
     if line.pointing is not None:
         yield from _pointing(line, line.pointing, settings, at)
 
 
-def _untrusted_surfaces(name: str, surface: ActiveSurface, at: datetime) -> Alarm:
+def find_untrusted(line: HeliostatOverview, at: datetime) -> Alarm | None:
+    """The alarm that a heliostat's surface is not trusted; None without warnings."""
+    surface = line.surface or line.candidate
+    if surface is None or not surface.warnings:
+        return None
     since = surface.warned_since or surface.created_at or at
     photographs = tuple(surface.suspicious or ())
     which = f"photograph{'s' if len(photographs) > 1 else ''} {', '.join(photographs)}"
     return Alarm(
         "untrusted",
-        name,
+        line.name,
         since,
         "; ".join(surface.warnings or ()),
         f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict"
@@ -289,8 +299,9 @@ _WARNED: dict[Reason, tuple[str, str, str]] = {
 def _warned(session: Session) -> Iterator[Alarm]:
     """Find heliostats that have measurements with a warning; excluded measurements do not count."""
     row, photograph = HeliostatRow, MeasurementRow
-    count, came = func.count(func.distinct(_photograph())), func.min(photograph.created_at)
-    query = select(row.name, count, came).group_by(row.id, row.name)
+    count = func.count(func.distinct(_photograph()))
+    began = func.min(func.coalesce(photograph.taken_at, photograph.created_at))
+    query = select(row.name, count, began).group_by(row.id, row.name)
     query = query.join(photograph, photograph.heliostat_id == row.id)
     query = query.where(
         photograph.warnings.is_not(None), func.coalesce(photograph.reason, "") != EXCLUDED
@@ -319,20 +330,45 @@ def _accuracies(session: Session, settings: Settings) -> Iterator[Alarm]:
         DriftRow.accuracy < least
     )
     for name, accuracy, poor_since, taken_at in session.execute(poor):
-        since = poor_since or taken_at
-        message = (
-            f"its newest photograph was forecast with an accuracy of {accuracy:.0%}, and"
-            f" {least:.0%} is the least"
-        )
-        action = "predict its surface again; if that does not help, study the photographs"
-        yield Alarm(
-            "accuracy",
-            name,
-            since,
-            message,
-            action,
-            _fingerprint(since, (1 - accuracy) / max(1 - least, 1e-6)),
-        )
+        yield _poor_forecast(name, accuracy, poor_since or taken_at, least)
+
+
+def _poor_forecast(name: str, accuracy: float, since: datetime, least: float) -> Alarm:
+    return Alarm(
+        "accuracy",
+        name,
+        since,
+        f"its newest photograph was forecast with an accuracy of {accuracy:.0%}, and"
+        f" {least:.0%} is the least",
+        "predict its surface again; if that does not help, study the photographs",
+        _fingerprint(since, (1 - accuracy) / max(1 - least, 1e-6)),
+    )
+
+
+def find_ended_accuracies(
+    session: Session, settings: Settings, after: datetime, open_since: Mapping[str, datetime]
+) -> Iterator[tuple[Alarm, datetime]]:
+    """Alarms of poor forecasts that photographs stored ``after`` a time ended, with their ends.
+
+    ``open_since`` is when the alarms began that are recorded as present, by heliostat.
+    """
+    row, least = MeasurementRow, settings.alarm_accuracy
+    query = select(HeliostatRow.name, row.taken_at, row.forecast_accuracy)
+    query = query.join(row, row.heliostat_id == HeliostatRow.id).where(
+        row.accepted, row.created_at > after, row.taken_at.is_not(None)
+    )
+    query = query.where(row.forecast_accuracy.is_not(None))
+    found = session.execute(query.order_by(HeliostatRow.name, row.taken_at, row.id))
+    for name, photographs in groupby(found, itemgetter(0)):
+        begun, poor = open_since.get(name), least
+        for _, at, accuracy in photographs:
+            assert at is not None
+            assert accuracy is not None
+            if accuracy < least:
+                begun, poor = begun or at, accuracy
+            elif begun is not None and begun <= at:
+                yield _poor_forecast(name, poor, begun, least), at
+                begun = None
 
 
 def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alarm]:

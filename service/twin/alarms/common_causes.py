@@ -180,7 +180,7 @@ def _photographed(session: Session, cause: CommonCause) -> Iterator[str]:
 def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterator[str]:
     """What the photographs of the burst have in common."""
     row = MeasurementRow
-    moment = row.created_at if reason in _ON_ARRIVAL else row.taken_at
+    moment = func.coalesce(row.taken_at, row.created_at)
     query = (
         select(TargetRow.name, row.sent_by, row.wind_speed_m_s, row.warnings)
         .join(TargetRow, TargetRow.id == row.target_id)

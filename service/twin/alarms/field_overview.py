@@ -1,16 +1,18 @@
 """Overview of the field: every heliostat with the state of its twin."""
 
+import logging
 import math
-import threading
 import time
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from sqlalchemy import case, func, select, union_all
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from model.surface import canting_rises, split_canting
@@ -18,32 +20,38 @@ from service import store
 from service.base.arrays import unpack
 from service.base.errors import BusyError
 from service.base.recent_results import RecentResults
+from service.store import field_state
 from service.store.columns import now
-from service.store.job_tables import AuditRow
+from service.store.job_tables import AuditRow, JobRow
 from service.store.surfaces.surface_versions import newest_first
-from service.store.tables import HeliostatRow, MeasurementRow, MountRow, SurfaceRow
+from service.store.tables import (
+    HeliostatRow,
+    HeliostatStateRow,
+    MeasurementRow,
+    MountRow,
+    SurfaceRow,
+)
 from service.twin.plant import model_versions
-from service.twin.pointing.errors import MountKey, PointingCache, PointingState
+from service.twin.pointing.errors import MountKey, PointingState, find_pointing
 from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CameraWatch
-from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
+from service.twin.surfaces.accuracy import Rank, rank_of_active, result_key
 
 Result = TypeVar("Result")
+logger = logging.getLogger("heliotwin.service")
 
 # Tables whose newest rows show whether the field has changed, and the number of rows to read.
-_TABLES = (HeliostatRow, MeasurementRow, SurfaceRow, MountRow, AuditRow)
+_TABLES = (HeliostatRow, MeasurementRow, SurfaceRow, MountRow, AuditRow, JobRow)
 _NEWEST = 1000
 # If reading the field takes less than `_QUICK_S` [s], each request waits for the current state, at
-# most `PATIENCE_S` [s]. Reading also waits `_QUICK_S` for surface figures.
+# most `PATIENCE_S` [s].
 _QUICK_S = 0.2
 PATIENCE_S = 20.0
-# Results for a field of more than `_LARGE` heliostats are reused for this time [s], if the store is
+# Results for a field of more than `LARGE` heliostats are reused for this time [s], if the store is
 # unchanged. For smaller fields they take milliseconds.
 _RECENT_S = 2.0
-_LARGE = 1000
-# Cached figures [1]: several times the surfaces of the largest plant.
-_MOST = 200_000
+LARGE = 1000
+_POINTING = TypeAdapter(PointingState)
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,8 @@ class HeliostatOverview:
 
     A ``rank`` without an accuracy means that no photograph can evaluate the surface, because it was
     computed from all of them. ``candidate`` is the newest version of a heliostat without an active
-    surface. ``range_m`` is the distance to the nearest receiver's centre [m].
+    surface. ``range_m`` is the distance to the nearest receiver's centre [m]. ``id`` is the row id.
+    ``pending`` are the results that no worker has computed yet, with what they will be based on.
     """
 
     name: str
@@ -135,6 +144,8 @@ class HeliostatOverview:
     mounted: MountKey | None = None
     pointing: PointingState | None = None
     candidate: ActiveSurface | None = None
+    id: int = 0
+    pending: Mapping[str, int | str] = field(default_factory=dict)
 
     @property
     def pointing_m(self) -> float | None:
@@ -143,17 +154,15 @@ class HeliostatOverview:
             return None
         return 1e-3 * self.pointing.error_mrad * self.range_m
 
-    def state(self, model: int) -> AccuracyState | None:
-        """State that the accuracy depends on, under a version of the model.
+    def accuracy_key(self, model: int) -> str | None:
+        """What the accuracy is based on, under a version of the model.
 
         None if there is no surface or no photograph to compare.
         """
         if self.surface is None or self.newest is None:
             return None
         calibrated_at = None if self.mounted is None else self.mounted.calibrated_at
-        return AccuracyState(
-            self.name, self.surface.id, self.newest, self.corrected, model, calibrated_at
-        )
+        return result_key(self.surface.id, self.newest, self.corrected, model, calibrated_at)
 
 
 def _current_surfaces(
@@ -259,12 +268,13 @@ def _mounts(session: Session, heliostat: int | None) -> dict[int, tuple[int, dat
 def read_summaries(session: Session, heliostat: int | None = None) -> list[HeliostatOverview]:
     """Summarize all heliostats in the order of their names, or only one.
 
-    Surface figures, accuracies and pointing errors are not included.
+    Results that take long to compute are those that a worker wrote, if they are valid.
     """
     surfaces, candidates = _current_surfaces(session, heliostat)
     photographs, mounted = _photographs(session, heliostat), _mounts(session, heliostat)
     model = model_versions.current_number(session)
     receivers = [row.center_m for row in store.list_receivers(session)]
+    states = _states(session, heliostat)
     row, none = HeliostatRow, _PhotographCounts()
     query = select(row.id, row.name, row.photographs_changed_at, row.east_m, row.north_m, row.up_m)
     if heliostat is not None:
@@ -287,17 +297,102 @@ def read_summaries(session: Session, heliostat: int | None = None) -> list[Helio
             if mount is None
             else MountKey(name, *mount, taken.newest, corrected, model),
             candidate=candidates.get(number),
+            id=number,
         )
-        lines.append(line)
+        lines.append(_with_results(line, states.get(number), model))
     return lines
 
 
-Marks = tuple[tuple[int, int], ...]
-"""Last id, and sum of the newest ids, of each table; see `_cache_marks`."""
+def _states(session: Session, heliostat: int | None) -> dict[int, HeliostatStateRow]:
+    """What workers computed, by heliostat id."""
+    query = select(HeliostatStateRow)
+    if heliostat is not None:
+        query = query.where(HeliostatStateRow.heliostat_id == heliostat)
+    return {row.heliostat_id: row for row in session.scalars(query)}
 
 
-def _cache_marks(session: Session) -> Marks:
-    """Last id, and sum of the newest ids, of each table behind the overview.
+def _with_results(
+    line: HeliostatOverview, state: HeliostatStateRow | None, model: int
+) -> HeliostatOverview:
+    """Add the results of a state that are valid, and name those that are pending."""
+    keys = {
+        "surface": None if line.surface is None else line.surface.id,
+        "accuracy": line.accuracy_key(model),
+        "pointing": None if line.mounted is None else line.mounted.key,
+    }
+    wanted = {name: key for name, key in keys.items() if key is not None}
+    state = state or HeliostatStateRow()
+    valid = [name for name, key in wanted.items() if getattr(state, _RESULTS[name].key) == key]
+    totals, pointing = None, None
+    if "surface" in valid and state.deviation_mm is not None:
+        totals = FieldTotals(state.deviation_mm, state.uncertainty_mm)
+    if "pointing" in valid and state.pointing is not None:
+        pointing = _POINTING.validate_python(state.pointing)
+    rank = Rank(state.accuracy, state.held_out or 0) if "accuracy" in valid else None
+    pending = {name: key for name, key in wanted.items() if name not in valid}
+    return replace(line, figures=totals, rank=rank, pointing=pointing, pending=pending)
+
+
+# --- results that take long to compute
+# --------------------------------------------------------------------------------------------------
+
+
+def compute_results(runtime: Runtime, line: HeliostatOverview) -> dict[str, object]:
+    """Compute the pending results of a heliostat, as columns of `HeliostatStateRow`."""
+    columns: dict[str, object] = {"computed_at": now()}
+    for name, key in line.pending.items():
+        result = _RESULTS[name]
+        columns |= dict.fromkeys(result.columns) | {result.key: key}
+        try:
+            columns |= zip(result.columns, result.compute(runtime, line), strict=True)
+        except SQLAlchemyError:
+            raise
+        except Exception:  # those of other heliostats must be computed
+            logger.exception("heliostat %s: its %s cannot be computed", line.name, name)
+    return columns
+
+
+def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+    assert line.surface is not None
+    with runtime.database.reading() as session:
+        query = select(SurfaceRow.arrays).where(SurfaceRow.id == line.surface.id)
+        totals = field_totals(session.scalars(query).one())
+    return totals.deviation_mm, totals.uncertainty_mm
+
+
+def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+    rank = rank_of_active(runtime, line.name)
+    return rank.accuracy, rank.photographs
+
+
+def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+    assert line.mounted is not None
+    pointing = find_pointing(runtime, line.mounted)
+    return (pointing and _POINTING.dump_python(pointing, mode="json"),)
+
+
+class _StoredResult(NamedTuple):
+    """Columns of a result in `HeliostatStateRow`, that of its key, and the function for it."""
+
+    key: str
+    columns: tuple[str, ...]
+    compute: Callable[[Runtime, HeliostatOverview], tuple[Any, ...]]
+
+
+_RESULTS = {
+    "surface": _StoredResult("surface_id", ("deviation_mm", "uncertainty_mm"), _compute_totals),
+    "accuracy": _StoredResult("accuracy_key", ("accuracy", "held_out"), _compute_accuracy),
+    "pointing": _StoredResult("pointing_key", ("pointing",), _compute_pointing),
+}
+"""Results of a heliostat that take long to compute."""
+
+
+# --- changes of the field
+# --------------------------------------------------------------------------------------------------
+
+
+def read_marks(session: Session) -> str:
+    """Last id, and sum of the newest ids, of each table behind the overview and the alarms.
 
     Other changes of a summary leave an entry in the audit trail. A transaction that began earlier
     may end later. The last id alone would miss its rows.
@@ -309,53 +404,26 @@ def _cache_marks(session: Session) -> Marks:
         select(func.coalesce(func.max(end.c.id), 0), func.coalesce(func.sum(end.c.id), 0))
         for end in ends
     ]
-    return tuple((int(last), int(total)) for last, total in session.execute(union_all(*each)))
+    waiting = select(func.count(), func.coalesce(func.sum(JobRow.id), 0)).where(
+        JobRow.state.in_(("queued", "running"))
+    )
+    found = session.execute(union_all(*each, waiting))
+    model = model_versions.current_number(session)
+    return " ".join(f"{int(last)}:{int(total)}" for last, total in found) + f" {model}"
 
 
-class Summaries(NamedTuple):
-    """Heliostats, and the number of those with pending results."""
+class _Snapshot(NamedTuple):
+    """Summaries as read at one time, and how long that took [s]."""
 
     lines: list[HeliostatOverview]
-    pending: int
+    took_s: float
 
 
-class _Snapshot:
-    """Summaries as read at one time; slow results are added as they become known."""
-
-    def __init__(self, lines: list[HeliostatOverview], model: int, took_s: float) -> None:
-        self.took_s, self.count = took_s, len(lines)
-        self._lines, self._lock = lines, threading.Lock()
-        self._figures = {
-            i: line.surface.id for i, line in enumerate(lines) if line.surface is not None
-        }
-        self._ranks = {
-            i: state for i, line in enumerate(lines) if (state := line.state(model)) is not None
-        }
-        self._mounts = {i: line.mounted for i, line in enumerate(lines) if line.mounted is not None}
-
-    def complete(
-        self,
-        figures: BackgroundCache[int, FieldTotals | None],
-        ranks: AccuracyCache,
-        pointing: PointingCache,
-        wait_s: float = 0.0,
-    ) -> Summaries:
-        """The summaries with all results that are known now."""
-        with self._lock:
-            shapes, _ = figures.get_many(self._figures.values(), wait_s)
-            worth, _ = ranks.get_many(self._ranks.values())
-            pointed, _ = pointing.get_many(self._mounts.values())
-            lines = self._lines.copy()  # other threads may still read the old list
-            for i in [i for i, number in self._figures.items() if number in shapes]:
-                lines[i] = replace(lines[i], figures=shapes[self._figures.pop(i)])
-            for i in [i for i, state in self._ranks.items() if state.heliostat in worth]:
-                lines[i] = replace(lines[i], rank=worth[self._ranks.pop(i).heliostat])
-            for i in [i for i, state in self._mounts.items() if state.heliostat in pointed]:
-                lines[i] = replace(lines[i], pointing=pointed[self._mounts.pop(i).heliostat])
-            self._lines = lines
-            return Summaries(
-                lines, len(self._figures.keys() | self._ranks.keys() | self._mounts.keys())
-            )
+def with_pointing(runtime: Runtime, line: HeliostatOverview) -> HeliostatOverview:
+    """Add a heliostat's pointing error, computed now if pending; no session should be open."""
+    if line.mounted is None or "pointing" not in line.pending:
+        return line
+    return replace(line, pointing=find_pointing(runtime, line.mounted))
 
 
 @dataclass(frozen=True)
@@ -372,7 +440,7 @@ class FieldOverview:
 
 
 class FieldOverviewCache:
-    """Cache of the field overview and of the slow results per heliostat.
+    """Cache of the field overview.
 
     Reading a large field takes longer than a page may wait. Until it is read, pages show the
     previous state.
@@ -380,26 +448,20 @@ class FieldOverviewCache:
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._accuracies, self._pointing = AccuracyCache(runtime), PointingCache(runtime)
-        self._figures: BackgroundCache[int, FieldTotals | None] = BackgroundCache(
-            self._figures_of, None, "figures", _MOST
-        )
-        self._readings: BackgroundCache[tuple[Marks, int], _Snapshot | None] = BackgroundCache(
+        self._readings: BackgroundCache[str, _Snapshot | None] = BackgroundCache(
             self._read, None, "field", 1
         )
         self._last: _Snapshot | None = None
-        self.cameras = CameraWatch()
         self._recent = RecentResults(_RECENT_S)
 
     def close(self) -> None:
         """Stop the background work."""
-        for cache in (self._readings, self._figures, self._accuracies, self._pointing):
-            cache.close()
+        self._readings.close()
 
     @property
     def is_large(self) -> bool:
         """Whether a page does not wait for results of all heliostats."""
-        return self._last is not None and self._last.count > _LARGE
+        return self._last is not None and len(self._last.lines) > LARGE
 
     def recent(self, session: Session, key: Hashable, compute: Callable[[], Result]) -> Result:
         """The result of ``compute``, or for a large field a recent one.
@@ -408,7 +470,7 @@ class FieldOverviewCache:
         """
         if not self.is_large:
             return compute()
-        return self._recent.get((_cache_marks(session), key), compute)
+        return self._recent.get((read_marks(session), key), compute)
 
     def read(self, session: Session, timeout_s: float = 0.0) -> FieldOverview:
         """Read the field overview.
@@ -424,34 +486,16 @@ class FieldOverviewCache:
         last = self._last
         if last is None or last.took_s < _QUICK_S:
             timeout_s = PATIENCE_S
-        found = self._readings.wait_for(
-            (_cache_marks(session), model_versions.current_number(session)), timeout_s
-        )
+        states = field_state.read_field_state(session).states
+        found = self._readings.wait_for(f"{read_marks(session)} {states}", timeout_s)
         reading = self._last = found or last
         if reading is None:
             raise BusyError("the field is being read; ask again as Retry-After says")
-        return FieldOverview(
-            *reading.complete(self._figures, self._accuracies, self._pointing), found is None
-        )
+        pending = sum(bool(line.pending) for line in reading.lines)
+        return FieldOverview(reading.lines, pending, found is None)
 
-    def with_pointing(self, line: HeliostatOverview) -> HeliostatOverview:
-        """Add a heliostat's pointing error, and wait for it; no session should be open."""
-        return (
-            line
-            if line.mounted is None
-            else replace(line, pointing=self._pointing.wait_for(line.mounted))
-        )
-
-    def _read(self, depends: tuple[Marks, int]) -> _Snapshot:
-        _, model = depends
+    def _read(self, _key: str) -> _Snapshot:
         start = time.perf_counter()
         with self._runtime.database.reading() as session:
-            reading = _Snapshot(read_summaries(session), model, time.perf_counter() - start)
-        reading.complete(self._figures, self._accuracies, self._pointing, _QUICK_S)
-        return reading
-
-    def _figures_of(self, surface: int) -> FieldTotals:
-        with self._runtime.database.reading() as session:
-            return field_totals(
-                session.scalars(select(SurfaceRow.arrays).where(SurfaceRow.id == surface)).one()
-            )
+            lines = read_summaries(session)
+        return _Snapshot(lines, time.perf_counter() - start)

@@ -1,12 +1,11 @@
 """Pointing errors of heliostats: their size, their trend, and moves.
 
 The errors of calibration photographs are those stored with the mount. Later photographs are
-compared with the mount that is valid now. Results are computed in the background and cached, as
-accuracies are.
+compared with the mount that is valid now.
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
@@ -25,8 +24,8 @@ from service.store.pointing import mounts
 from service.store.tables import MountRow
 from service.twin.heliostats.stored_mount import StoredMount, stored_mount
 from service.twin.pointing.calibration import load_readings
-from service.twin.runtime.background_cache import BackgroundCache, CachedResults
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import result_key
 
 Array = NDArray[np.float64]
 
@@ -45,9 +44,6 @@ _IN_A_ROW = 2
 
 # Photographs since the calibration that are read, the newest.
 _MAX_READ = 256
-
-# Cached results [1]: several times the heliostats of the largest plant.
-_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -200,7 +196,7 @@ def _drifted(mount: MountRow) -> PointingDrift | None:
     return PointingDrift(datetime.fromisoformat(first), datetime.fromisoformat(at[-1]), size)
 
 
-# --- cached
+# --- of a heliostat
 # --------------------------------------------------------------------------------------------------
 
 
@@ -219,41 +215,23 @@ class MountKey:
     corrected: datetime | None
     model: int
 
+    @property
+    def key(self) -> str:
+        """Text of all of it but the heliostat."""
+        parts = (self.mount, self.calibrated_at, self.newest, self.corrected, self.model)
+        return result_key(*parts)
 
-class PointingCache:
-    """Cache of pointing by `MountKey`; None if the mount is not valid any more."""
 
-    def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
-        self._cache: BackgroundCache[MountKey, PointingState | None] = BackgroundCache(
-            self._pointing, None, "pointing", _MOST
-        )
-
-    def get_many(self, states: Iterable[MountKey]) -> CachedResults[str, PointingState | None]:
-        """Known pointing by heliostat, and the number of pending ones."""
-        known, missing = self._cache.get_many(states)
-        by_heliostat = {state.heliostat: pointing for state, pointing in known.items()}
-        return CachedResults(by_heliostat, missing)
-
-    def wait_for(self, state: MountKey, seconds: float = 5.0) -> PointingState | None:
-        """Pointing of one heliostat; None if it is not ready after ``seconds``."""
-        return self._cache.wait_for(state, seconds)
-
-    def close(self) -> None:
-        """Stop the background work and wait for the current computation."""
-        self._cache.close()
-
-    def _pointing(self, state: MountKey) -> PointingState | None:
-        try:
-            with self._runtime.database.reading() as session:
-                mount = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
-                stored, newer = _newer(session, state.heliostat, mount)
-            return pointing_state(stored, mount, newer, self._runtime.settings.alarm_pointing_mrad)
-        except (ModelError, ServiceError) as error:
-            logger.info(
-                "the pointing error of heliostat %s is not known: %s", state.heliostat, error
-            )
-        return None
+def find_pointing(runtime: Runtime, state: MountKey) -> PointingState | None:
+    """Pointing of a heliostat; None, logged, if the mount is not valid any more."""
+    try:
+        with runtime.database.reading() as session:
+            mount = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
+            stored, newer = _newer(session, state.heliostat, mount)
+        return pointing_state(stored, mount, newer, runtime.settings.alarm_pointing_mrad)
+    except (ModelError, ServiceError) as error:
+        logger.info("the pointing error of heliostat %s is not known: %s", state.heliostat, error)
+    return None
 
 
 def _newer(session: Session, name: str, mount: MountRow) -> tuple[StoredMount, list[Reading]]:

@@ -18,6 +18,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from cachetools import TTLCache
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -78,6 +79,10 @@ class CameraChange:
     ratio: float
     certainty: float
     days: tuple[int, int]
+
+
+CHANGES = TypeAdapter(list[CameraChange])
+"""Camera changes as JSON and back."""
 
 
 def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraChange | None:

@@ -1,4 +1,4 @@
-"""Accuracy of the active surfaces on photographs, computed once per heliostat and cached.
+"""Accuracy of the active surfaces on photographs.
 
 Forecast and photograph are compared in a 4 m window about the photograph's centre of mass
 (DESIGN.md, section 7). A result is valid until the heliostat gets another surface or photograph, or
@@ -6,7 +6,7 @@ the plant's model another version.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from statistics import fmean
@@ -35,16 +35,12 @@ from service.twin.heliostats.measurements import (
     load_heliostat_context,
 )
 from service.twin.plant import model_versions
-from service.twin.runtime.background_cache import BackgroundCache, CachedResults
+from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.service")
 RECENT = 8
 """Number of a heliostat's newest photographs that are compared with a forecast."""
-
-
-# Cached results [1]: several times the heliostats of the largest plant.
-_MOST = 200_000
 
 # Heliostats with cached comparisons: half a megabyte each, three times that for a span.
 _MAX_COMPARED = 64
@@ -202,52 +198,22 @@ def rank_of(comparisons: Sequence[Comparison]) -> Rank:
     return Rank(fmean(unseen) if unseen else None, len(unseen))
 
 
-@dataclass(frozen=True)
-class AccuracyState:
-    """What a heliostat's accuracy depends on.
-
-    ``surface`` and ``newest`` are row ids of the surface and the newest photograph. ``corrected``
-    is when a photograph was last corrected, filled or deleted. ``model`` is the version of the
-    plant's model. ``calibrated_at`` is when the mount was calibrated.
-    """
-
-    heliostat: str
-    surface: int
-    newest: int
-    corrected: datetime | None
-    model: int
-    calibrated_at: datetime | None = None
+def rank_of_active(runtime: Runtime, heliostat: str) -> Rank:
+    """Accuracy of a heliostat's active surface; failures are logged."""
+    try:
+        with runtime.database.reading() as session:
+            surface = store.get_surface_at(session, store.get_heliostat(session, heliostat))
+        return rank_of(compare(runtime, heliostat, surface))
+    except (ModelError, ServiceError) as error:
+        logger.warning("the accuracy of heliostat %s is not known: %s", heliostat, error)
+    return Rank(None, 0)
 
 
-class AccuracyCache:
-    """Cache of accuracies by `AccuracyState`; missing ones are computed in the background."""
-
-    def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
-        self._cache: BackgroundCache[AccuracyState, Rank] = BackgroundCache(
-            self._rank, Rank(None, 0), "accuracy", _MOST
-        )
-
-    def get_many(self, states: Iterable[AccuracyState]) -> CachedResults[str, Rank]:
-        """Known accuracies by heliostat, and the number of pending ones."""
-        known, missing = self._cache.get_many(states)
-        return CachedResults({state.heliostat: rank for state, rank in known.items()}, missing)
-
-    def close(self) -> None:
-        """Stop the background work and wait for the current computation."""
-        self._cache.close()
-
-    def _rank(self, state: AccuracyState) -> Rank:
-        """Accuracy of the surface that is active now; failures are logged."""
-        try:
-            with self._runtime.database.reading() as session:
-                surface = store.get_surface_at(
-                    session, store.get_heliostat(session, state.heliostat)
-                )
-            return rank_of(compare(self._runtime, state.heliostat, surface))
-        except (ModelError, ServiceError) as error:
-            logger.warning("the accuracy of heliostat %s is not known: %s", state.heliostat, error)
-        return Rank(None, 0)
+def result_key(*parts: datetime | int | None) -> str:
+    """Text of what a result is based on: row ids, and times of changes."""
+    return " ".join(
+        str(part.timestamp()) if isinstance(part, datetime) else str(part) for part in parts
+    )
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,8 @@ from service.base import fields
 from service.base.fields import Author, CreatedAt, From, Id, Model, Name, Version, from_row
 from service.store import acknowledgements
 from service.store.acknowledgements import AcknowledgementBatch, AlarmHistory
-from service.twin.alarms.acknowledging import (
-    AlarmFilter,
-    acknowledge,
-    read_history,
-    undo_acknowledgement,
-)
-from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.acknowledging import AlarmFilter, acknowledge, undo_acknowledgement
+from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.common_causes import find_common_causes
 from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.reasons import REASONS, Reason, Severity
@@ -25,7 +20,6 @@ from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
     READ,
-    FieldCacheDep,
     IdentityDep,
     Limit,
     RuntimeDep,
@@ -80,8 +74,12 @@ def alarm_out(item: Alarm) -> AlarmOut:
 class AlarmPage(Page[AlarmOut]):
     """A part of the list of alarms."""
 
+    computed_at: datetime = Field(description="When a worker last wrote the alarms.")
     pending: int = Field(
-        description="Heliostats whose pointing error is still being computed; ask again for them."
+        description=(
+            "Heliostats of which results are still being computed; at least 1 if something was"
+            " stored since the alarms were written. Ask again."
+        )
     )
 
 
@@ -116,9 +114,11 @@ class AlarmHistoryOut(BaseModel):
     )
     heliostat: str | None = Field(description="null: the plant as a whole.")
     since: From
-    message: str = Field(description="What was wrong, when it was first seen.")
-    opened_at: datetime = Field(description="When the service first saw it.")
-    closed_at: datetime | None = Field(description="When it was gone; null: it is present.")
+    message: str = Field(description="What is or was wrong.")
+    ended_at: datetime | None = Field(
+        description="Time of the photograph or the decision that ended it; null: it is present."
+    )
+    recorded_at: datetime = Field(description="When a worker first wrote it.")
     acknowledgements: list[AcknowledgementOut] = Field(
         description="Its acknowledgements, oldest first; also those that were undone."
     )
@@ -153,7 +153,6 @@ AlarmCountDep = Annotated[AlarmCount, Depends(_count)]
 @router.get("", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
 def list_alarms(
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
     severity: Annotated[
         int | None, Query(ge=1, le=3, description="Only this severity: 1, 2 or 3.")
@@ -167,11 +166,11 @@ def list_alarms(
 ) -> AlarmPage:
     """List alarms, in the order of ids. The thresholds are those of the current settings."""
     with runtime.database.reading() as session:
-        items, pending = find_alarms(session, cache, runtime.settings)
+        items, computed_at, pending = read_alarms(session)
     chosen = AlarmFilter(reason, severity, heliostat, acknowledged).choose(items)
     wanted = sorted((item for item in chosen if after is None or item.id > after), key=_ID)
     part = page([alarm_out(item) for item in wanted[: limit + 1]], limit)
-    return AlarmPage(items=part.items, next=part.next, pending=pending)
+    return AlarmPage(items=part.items, next=part.next, computed_at=computed_at, pending=pending)
 
 
 @router.post(
@@ -180,11 +179,7 @@ def list_alarms(
     dependencies=[OPERATE, Depends(require_json)],
 )
 def post_acknowledgements(
-    runtime: RuntimeDep,
-    cache: FieldCacheDep,
-    count: AlarmCountDep,
-    identity: IdentityDep,
-    seen: Annotated[AcknowledgementsIn, Body()],
+    runtime: RuntimeDep, identity: IdentityDep, seen: Annotated[AcknowledgementsIn, Body()]
 ) -> Page[AlarmOut]:
     """Acknowledge alarms together, with a reason.
 
@@ -192,9 +187,8 @@ def post_acknowledgements(
     undone. The first one is kept.
     """
     with runtime.database.reading() as session:
-        found = find_alarms(session, cache, runtime.settings)
+        found = read_alarms(session)
     items = acknowledge(runtime, found, seen.ids, identity.name, seen.reason)
-    count.forget()
     return Page(items=[alarm_out(item) for item in items], next=None)
 
 
@@ -214,22 +208,20 @@ def list_acknowledgements(
 def undo_acknowledgements(
     number: Annotated[Version, Path(description="Number of the acknowledgement.")],
     runtime: RuntimeDep,
-    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> AcknowledgementOut:
     """Undo an acknowledgement: its alarms are open again."""
     undo_acknowledgement(runtime, number, identity.name)
-    count.forget()
     with runtime.database.reading() as session:
         (row,) = acknowledgements.list_batches(session, 1, number=number)
     return _acknowledgement(row)
 
 
 @router.get("/causes", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
-def list_alarm_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonCauseOut]:
+def list_alarm_causes(runtime: RuntimeDep) -> Page[CommonCauseOut]:
     """List probable causes of open alarms, the one of most first."""
     with runtime.database.reading() as session:
-        items, _ = find_alarms(session, cache, runtime.settings)
+        items = read_alarms(session).alarms
         causes = find_common_causes(session, items, runtime.settings)
     return Page(
         items=[
@@ -249,14 +241,14 @@ def list_alarm_causes(runtime: RuntimeDep, cache: FieldCacheDep) -> Page[CommonC
 @router.get("/history", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
 def list_alarm_history(
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
     reason: Annotated[Reason | None, Query(description="Only this reason.")] = None,
     heliostat: Annotated[Name | None, Query(description="Only this heliostat.")] = None,
     limit: Limit = 100,
     after: After = None,
 ) -> Page[AlarmHistoryOut]:
     """List alarms that are or were present, the newest first."""
-    rows = read_history(runtime, cache, limit + 1, after, AlarmFilter(reason, None, heliostat))
+    with runtime.database.reading() as session:
+        rows = acknowledgements.list_history(session, limit + 1, after, reason, heliostat)
     return page([_history(row) for row in rows], limit)
 
 

@@ -8,15 +8,9 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.fields import from_row
 from service.twin.alarms.causes import CauseKind, rank_causes, read_facts
-from service.twin.alarms.field_overview import read_summaries
+from service.twin.alarms.field_overview import read_summaries, with_pointing
 from service.twin.surfaces.accuracy import ComparisonResult
-from service.web.auth.dependencies import (
-    READ,
-    ComparisonCacheDep,
-    FieldCacheDep,
-    NamePath,
-    RuntimeDep,
-)
+from service.web.auth.dependencies import READ, ComparisonCacheDep, NamePath, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page
 
@@ -47,16 +41,14 @@ class LikelyCausePage(Page[LikelyCauseOut]):
 
 
 @router.get("", responses=problems(404), dependencies=[READ])
-def list_causes(
-    name: NamePath, runtime: RuntimeDep, cache: ComparisonCacheDep, field: FieldCacheDep
-) -> LikelyCausePage:
+def list_causes(name: NamePath, runtime: RuntimeDep, cache: ComparisonCacheDep) -> LikelyCausePage:
     """Rank the likely causes of a heliostat's poor forecasts."""
     with runtime.database.reading() as session:
         row = store.get_heliostat(session, name)
         surface = store.find_surface_at(session, row)
         key, (line,) = cache.read(session, row, surface), read_summaries(session, row.id)
     compared = ComparisonResult() if key is None else cache.wait_for(key)
-    line = field.with_pointing(line)
+    line = with_pointing(runtime, line)
     comparisons = () if compared is None else compared.comparisons
     with runtime.database.reading() as session:
         facts = read_facts(session, line, row, surface, comparisons, runtime.settings)

@@ -10,7 +10,12 @@ from pydantic import BaseModel, Field
 from service import store
 from service.base.errors import NotFoundError
 from service.base.fields import From, HeliostatOf, Name, UpTo
-from service.twin.alarms.field_overview import PATIENCE_S, HeliostatOverview, read_summaries
+from service.twin.alarms.field_overview import (
+    PATIENCE_S,
+    HeliostatOverview,
+    read_summaries,
+    with_pointing,
+)
 from service.twin.pointing.calibration import best_slot
 from service.web.api.mounts import PlannedOut, planned_out
 from service.web.auth.dependencies import READ, FieldCacheDep, Limit, NamePath, RuntimeDep
@@ -131,14 +136,14 @@ def list_pointing(
 
 
 @router.get("/heliostats/{name}/pointing", responses=problems(404), dependencies=[READ])
-def get_pointing(name: NamePath, runtime: RuntimeDep, cache: FieldCacheDep) -> HeliostatPointingOut:
+def get_pointing(name: NamePath, runtime: RuntimeDep) -> HeliostatPointingOut:
     """Get the pointing error of a heliostat, from its newest photographs.
 
     The response includes the trend, the last move, and the most informative next photograph.
     """
     with runtime.database.reading() as session:
         (line,) = read_summaries(session, store.get_heliostat(session, name).id)
-    line = cache.with_pointing(line)
+    line = with_pointing(runtime, line)
     if line.pointing is None:
         raise NotFoundError(
             f"heliostat {name} has no mount that fits it; POST to /v1/jobs/calibrations first"

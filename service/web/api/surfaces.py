@@ -40,13 +40,11 @@ from service.twin.alarms import acknowledging
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
-from service.web.api.alarms import AlarmCountDep
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
     OVERVIEW_SLOT,
     READ,
-    FieldCacheDep,
     IdentityDep,
     Limit,
     NamePath,
@@ -428,8 +426,6 @@ def acknowledge_surface(
     name: NamePath,
     version: Annotated[Version, Path(description="Number of the version, from 1.")],
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
-    count: AlarmCountDep,
     identity: IdentityDep,
     body: Annotated[SurfaceAcknowledgementIn, Body()],
 ) -> SurfaceSummary:
@@ -438,8 +434,7 @@ def acknowledge_surface(
     The answer is 409 if it is trusted. `POST /v1/alarms/acknowledgements/{number}/undo` undoes
     it.
     """
-    acknowledging.acknowledge_surface(runtime, cache, name, version, identity.name, body.reason)
-    count.forget()
+    acknowledging.acknowledge_surface(runtime, name, version, identity.name, body.reason)
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
         return surface_summary(name, row)

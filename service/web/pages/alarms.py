@@ -15,21 +15,13 @@ from service.twin.alarms.acknowledging import (
     AlarmFilter,
     acknowledge,
     group_alarms,
-    read_history,
     undo_acknowledgement,
 )
-from service.twin.alarms.alarms import Alarm, find_alarms
+from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.common_causes import find_common_causes
 from service.twin.alarms.reasons import REASONS, SEVERITIES, Reason
 from service.web.api.alarms import AlarmCountDep, ItemId
-from service.web.auth.dependencies import (
-    OPERATE,
-    OVERVIEW_SLOT,
-    READ,
-    FieldCacheDep,
-    IdentityDep,
-    RuntimeDep,
-)
+from service.web.auth.dependencies import OPERATE, OVERVIEW_SLOT, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import count_badge, go_to, render
 
 router = APIRouter(include_in_schema=False)
@@ -141,11 +133,12 @@ def get_alarms_page(
     request: Request,
     query: Annotated[AlarmQuery, Query()],
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
+    count: AlarmCountDep,
 ) -> HTMLResponse:
     """Alarms that are not acknowledged, or those that are, by severity and reason or in a list."""
     with runtime.database.reading() as session:
-        items, pending = find_alarms(session, cache, runtime.settings)
+        items, computed_at, pending = read_alarms(session)
+        count.read(session)
         done = query.done and acknowledgements.list_batches(session, 1, number=query.done)
         chosen = query.choose(items)
         causes = find_common_causes(session, chosen, runtime.settings)
@@ -164,15 +157,18 @@ def get_alarms_page(
         listed=_LISTED if query.reason is None else 5 * _LISTED,
         others=sum((item.acknowledged_by is not None) != query.acknowledged for item in items),
         done=done[0] if done else None,
+        computed_at=computed_at,
         pending=pending,
         limits=runtime.settings,
     )
 
 
 @router.get("/alarms/count", dependencies=[READ])
-def get_alarm_count(count: AlarmCountDep) -> Response:
+def get_alarm_count(runtime: RuntimeDep, count: AlarmCountDep) -> Response:
     """The number of alarms that are not acknowledged, for the menu."""
-    return HTMLResponse(count_badge(count.read()))
+    with runtime.database.reading() as session:
+        count.read(session)
+    return HTMLResponse(count_badge(count.last))
 
 
 @router.post("/alarms/acknowledgements", dependencies=[OPERATE])
@@ -180,14 +176,12 @@ def post_acknowledgement_form(
     query: Annotated[AlarmQuery, Query()],
     form: Annotated[AcknowledgementForm, Form()],
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
-    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> Response:
     """Acknowledge the ticked alarms and groups with one reason, and return to the list."""
     ids = dict.fromkeys(form.ids)
     with runtime.database.reading() as session:
-        found = find_alarms(session, cache, runtime.settings)
+        found = read_alarms(session)
         chosen = query.choose(found.alarms)
         causes = find_common_causes(session, chosen, runtime.settings)
     groups = {group.token: group.alarms for group in group_alarms(chosen)}
@@ -201,8 +195,6 @@ def post_acknowledgement_form(
             )
         ids |= dict.fromkeys(alarm.id for alarm in groups[token])
     done = acknowledge(runtime, found, list(ids), identity.name, form.comment)
-    count.forget()
-    count.read()
     return go_to(query.link(done=done[0].acknowledgement))
 
 
@@ -210,15 +202,12 @@ def post_acknowledgement_form(
 def post_undo_form(
     number: Annotated[Version, Path(description="Number of the acknowledgement.")],
     runtime: RuntimeDep,
-    count: AlarmCountDep,
     identity: IdentityDep,
     page: Annotated[Literal["alarms", "history"], Query()] = "alarms",
     heliostat: Annotated[Name | None, Query()] = None,
 ) -> Response:
     """Undo an acknowledgement, and return to the page."""
     undo_acknowledgement(runtime, number, identity.name)
-    count.forget()
-    count.read()
     if heliostat is not None:
         return go_to(f"/heliostats/{heliostat}#warnings-title")
     return go_to("/alarms" if page == "alarms" else "/alarms/history")
@@ -226,15 +215,13 @@ def post_undo_form(
 
 @router.get("/alarms/history", dependencies=[READ, OVERVIEW_SLOT])
 def get_alarm_history_page(
-    request: Request,
-    query: Annotated[HistoryQuery, Query()],
-    runtime: RuntimeDep,
-    cache: FieldCacheDep,
+    request: Request, query: Annotated[HistoryQuery, Query()], runtime: RuntimeDep
 ) -> HTMLResponse:
     """Acknowledgements with their reasons, and alarms that are or were present."""
-    wanted = AlarmFilter(query.reason, heliostat=query.heliostat)
-    rows = read_history(runtime, cache, _LISTED + 1, query.after, wanted)
     with runtime.database.reading() as session:
+        rows = acknowledgements.list_history(
+            session, _LISTED + 1, query.after, query.reason, query.heliostat
+        )
         batches = acknowledgements.list_batches(session, _BATCHES)
     return render(
         request,

@@ -12,14 +12,12 @@ from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.twin.alarms.acknowledging import acknowledge_surface
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
-from service.web.api.alarms import AlarmCountDep
 from service.web.api.corrections import predict_again
 from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
     OVERVIEW_SLOT,
-    FieldCacheDep,
     IdentityDep,
     NamePath,
     RuntimeDep,
@@ -104,13 +102,10 @@ def post_acknowledge_form(
     version: Annotated[Version, Path(description="Number of the version.")],
     form: Annotated[SurfaceAcknowledgementIn, Form()],
     runtime: RuntimeDep,
-    cache: FieldCacheDep,
-    count: AlarmCountDep,
     identity: IdentityDep,
 ) -> Response:
     """Acknowledge that a surface is not trusted, as its alarm."""
-    acknowledge_surface(runtime, cache, name, version, identity.name, form.reason)
-    count.forget()
+    acknowledge_surface(runtime, name, version, identity.name, form.reason)
     return go_to(f"/heliostats/{name}#warnings-title")
 
 

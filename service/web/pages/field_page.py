@@ -12,7 +12,6 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from pydantic import Field
-from starlette.background import BackgroundTask
 
 from service import store
 from service.base.fields import Search
@@ -302,6 +301,7 @@ def get_field(
     """The state of the field, its map with the filtered heliostats emphasized, and their table."""
     with runtime.database.reading() as session:
         now, plant = cache.read(session), session.get(PlantRow, 1)
+        alarms = count.read(session)
         work = cache.recent(
             session, ("work", view.period), partial(recent_work, session, view.period)
         )
@@ -312,8 +312,7 @@ def get_field(
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED
     scale = scale_for(chosen, runtime.settings)
-    alarms = count.at_once() if cache.is_large else count.by_severity()
-    page = render(
+    return render(
         request,
         "field.html",
         plant=None if plant is None else plant.name,
@@ -347,6 +346,3 @@ def get_field(
         # more heliostats are pending.
         again_ms=min(max(1500, 30 * now.pending), 15_000) if now.pending or now.is_behind else None,
     )
-    if alarms is None:  # the first count of a large field takes seconds
-        page.background = BackgroundTask(count.begin)
-    return page

@@ -43,6 +43,7 @@ from service.twin.alarms.field_overview import (
     HeliostatOverview,
     field_totals,
     read_summaries,
+    with_pointing,
 )
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.facets import facet_places
@@ -51,7 +52,6 @@ from service.twin.surfaces.accuracy import Comparison, ComparisonResult, rank_of
 from service.web.auth.dependencies import (
     READ,
     ComparisonCacheDep,
-    FieldCacheDep,
     NamePath,
     RenderSlotDep,
     RuntimeDep,
@@ -321,7 +321,6 @@ def _read(
     name: NamePath,
     runtime: RuntimeDep,
     cache: ComparisonCacheDep,
-    field: FieldCacheDep,
     version: Annotated[Version | None, Query()] = None,
     photographs: Annotated[PhotographVerdict | None, Query()] = None,
     candidate: Annotated[Version | None, Query()] = None,
@@ -350,7 +349,7 @@ def _read(
         zone = plant_time_zone(session, runtime.settings.time_zone)
     # The rest of the page does not depend on the comparisons.
     compared = ComparisonResult() if shown is None else cache.wait_for(shown) or _UNDER_WAY
-    line = field.with_pointing(line)
+    line = with_pointing(runtime, line)
     best = None if line.pointing is None else best_slot(runtime, name)
     likely, evidence = list[causes.LikelyCause](), None
     settings = runtime.settings

@@ -21,6 +21,7 @@ from service.store import keys
 from service.store.columns import now
 from service.store.job_tables import KeyRow
 from service.store.tables import HeliostatRow
+from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app
 from tests.service.browser.browsing import (
     DESK,
@@ -42,6 +43,7 @@ from tests.service.conftest import (
     properties_document,
     serving,
     tower_document,
+    write_state,
 )
 from tests.service.studies import SLOPE, study_row
 
@@ -275,7 +277,7 @@ def test_operator_sees_alarms(page: Any, served: Served, size: dict[str, int]):
         session.execute(
             update(HeliostatRow).where(HeliostatRow.name == "AB01").values(created_at=now() - days)
         )
-    served.app.state.alarms.forget()
+    write_state(FieldStateWriter(served.app.state.runtime))
     page.set_viewport_size(size)
     page.goto("/")
     expect(page.locator("nav .count")).to_have_text("1 not acknowledged")

@@ -106,6 +106,7 @@ def test_values_are_checked_by_the_database(database: Database):
     }
     columns = {
         "plant_single",
+        "field_state_single",
         "measurements_kind",
         "surfaces_source",
         "studies_verdict",

@@ -370,8 +370,8 @@ def test_severities_in_lists_tables_and_counts(stale: TestClient):
     assert {item["severity"] for item in items(stale, severity=3)} == {3}
     assert items(stale, severity=1) == []
     assert stale.get(PATH, params={"severity": 4}).status_code == 422
-    counts: AlarmCount = stale.app.state.alarms  # type: ignore[attr-defined]
-    assert counts.by_severity() == {1: 0, 2: 0, 3: 3}
+    with stale.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
+        assert AlarmCount().read(session) == {1: 0, 2: 0, 3: 3}
     assert stale.get("/alarms.csv").text.splitlines()[1].split(",")[1] == "3"
 
 
@@ -484,20 +484,20 @@ def test_history_of_alarms(app: FastAPI, client: TestClient, post: Post):
         3,
         item["since"],
     )
-    assert entry["opened_at"] < entry["closed_at"]
+    taken_at = client.get("/v1/heliostats/AA39/measurements").json()["items"][0]["taken_at"]
+    assert entry["ended_at"] == taken_at  # the photograph's time, not when it came
+    assert entry["ended_at"] < entry["recorded_at"]
     assert [(one["created_by"], one["reason"]) for one in entry["acknowledgements"]] == [
         ("local", "seen")
     ]
     page = client.get("/alarms/history", headers=HTML).text
     assert 'href="/alarms/history"' in client.get("/alarms", headers=HTML).text
     assert "None was ever accepted" in page
-    # The menu's count records, too.
     with app.state.runtime.database.writing() as session:
         session.execute(update(MeasurementRow).values(taken_at=now() - timedelta(days=50)))
-    app.state.alarms.forget()
     assert client.get("/alarms/count").text.startswith('<span class="count">1<')
     present = client.get(f"{PATH}/history", params={"limit": 1}).json()
-    assert present["items"][0]["closed_at"] is None
+    assert present["items"][0]["ended_at"] is None
     assert present["next"] is not None
 
 

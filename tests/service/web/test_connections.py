@@ -2,20 +2,15 @@
 busy.
 """
 
-import threading
 from contextlib import ExitStack
-from typing import Any
 
 import pytest
-from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from service.store import keys
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import AccuracyCache, AccuracyState, Rank
 from service.web.app import create_app
-from tests.service.conftest import FakeOperations, client_of, until
-from tests.waiting import WAIT_LIMIT_S
+from tests.service.conftest import FakeOperations, client_of
 
 
 def hold(runtime: Runtime, count: int, held: ExitStack) -> None:
@@ -50,25 +45,3 @@ def test_busy_pool_is_answered_with_when_to_come_again(settings: Settings, heade
         answer = client.get("/v1/targets", headers=headers)
     assert (answer.status_code, answer.headers.get("Retry-After")) == (503, "5")
     assert "busy" in answer.json()["detail"]
-
-
-def test_pending_accuracy_is_computed_once(client: TestClient, monkeypatch: pytest.MonkeyPatch):
-    begun, go = [], threading.Event()
-
-    def work(self: AccuracyCache, state: AccuracyState) -> Rank:
-        begun.append(state)
-        assert go.wait(WAIT_LIMIT_S)
-        return Rank(0.9, 3)
-
-    monkeypatch.setattr(AccuracyCache, "_rank", work)
-    app: Any = client.app
-    cache, state = AccuracyCache(app.state.runtime), AccuracyState("AA39", 1, 1, None, 1)
-    try:
-        cache.get_many([state])
-        until(lambda: bool(begun))
-        assert [cache.get_many([state]) for _ in range(3)] == [({}, 1)] * 3
-        go.set()
-        until(lambda: cache.get_many([state]) == ({"AA39": Rank(0.9, 3)}, 0))
-    finally:
-        cache.close()
-    assert begun == [state]

@@ -2,6 +2,7 @@
 over REST.
 """
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -294,7 +295,7 @@ def test_large_field_is_shown_as_it_was_until_it_is_read(
     monkeypatch.setattr(field_overview, "_QUICK_S", 0.0)  # every field is large
     put(database, "AA01")
     assert now(cache, database) == (["AA01"], False)
-    go, read = field_overview.threading.Event(), field_overview.read_summaries
+    go, read = threading.Event(), field_overview.read_summaries
     monkeypatch.setattr(
         field_overview, "read_summaries", lambda session: go.wait(WAIT_LIMIT_S) and read(session)
     )
@@ -317,11 +318,11 @@ def test_transaction_that_ends_late_is_seen(database: Database):
     with database.writing() as session:
         session.add(row(2))
     with database.reading() as session:
-        before = field_overview._cache_marks(session)
+        before = field_overview.read_marks(session)
     with database.writing() as session:
         session.add(row(1))
     with database.reading() as session:
-        assert field_overview._cache_marks(session) != before
+        assert field_overview.read_marks(session) != before
 
 
 def test_app_has_the_field(app: FastAPI) -> None:

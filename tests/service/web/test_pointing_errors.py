@@ -112,6 +112,7 @@ def test_move_since_the_calibration_is_reported_with_its_dates(
         True,
     )
     assert known["error_mrad"] < 2
+    of_field(client)
     assert (
         "moved between 2024-05-08 12:00 UTC and 2024-05-09 12:00 UTC"
         in client.get("/", headers=HTML).text
