@@ -78,9 +78,11 @@ def test_bad_name_in_a_path_is_refused(refusing: TestClient, name: str):
             "heliostats/{}/measurements",
             "heliostats/AA39/measurements/{}",
         ):
-            answer = refusing.get(f"/v1/{path.format(spelled.replace('.', '%2e'))}")
-            assert answer.status_code in (404, 422), (path, spelled)
-            assert "root:" not in answer.text
+            url = f"/v1/{path.format(spelled.replace('.', '%2e'))}"
+            for answer in (refusing.get(url), refusing.put(url, json={})):
+                assert answer.status_code in (404, 405, 422), (answer.request.method, url)
+                assert answer.headers["Content-Type"] == "application/problem+json"
+                assert "root:" not in answer.text
 
 
 @pytest.mark.parametrize("name", NAMES)
