@@ -194,6 +194,8 @@ From = Annotated[datetime, Field(description="When it began.")]
 
 Version = Annotated[int, Field(ge=1, le=2**31 - 1)]
 """For paths and queries."""
+ReadVersion = Annotated[int, Field(ge=0, le=2**31 - 1)] | None
+"""For forms: the hidden version of what the page showed."""
 VersionIn = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
 """For bodies."""
 

@@ -175,11 +175,12 @@ def _store_plant(
     plant, declared = folder.plant, folder.declared()
     every = [effect_to_json(effect) for effect in (*folder.model.effects, *effects)]
     declared = declared | ({"effects": every} if every else {})
+    by = setup.Authorship(RESERVED)
     with runtime.database.writing() as session:
-        setup.set_plant(session, RESERVED, plant, declared, facts=folder.facts)
+        setup.set_plant(session, by, plant, declared, facts=folder.facts)
         for name in plant.heliostats:
             try:
-                row, _ = setup.set_heliostat(session, RESERVED, name, folder.properties[name])
+                row, _ = setup.set_heliostat(session, by, name, folder.properties[name])
             except SKIPPED as error:
                 folder.skipped[name] = str(error)
                 continue
@@ -222,7 +223,9 @@ def _store_measurements(
                 )
                 if image.sha256 in images:
                     raise InvalidInputError("it is the image of another measurement")
-                pixels, measured = measure_photograph(runtime, photograph, data, twin, plane)
+                pixels, measured = measure_photograph(
+                    runtime, photograph, data, plane, twin.model.cameras
+                )
             except SKIPPED as error:
                 said = str(error)
                 refused[measurement.key] = said if str(file) in said else f"{file}: {said}"

@@ -52,7 +52,7 @@ def writing(makes: bool = False) -> Iterator["Session"]:
         if settings.migrates_on_start:
             database.upgrade()
         database.require_current()
-        with database.writing() as session:
+        with database.changing() as session:
             yield session
     finally:
         database.close()

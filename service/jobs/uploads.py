@@ -29,7 +29,6 @@ from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs.queue import ENDED
-from service.store.rows import serialize_writers
 from service.twin.runtime.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
@@ -84,8 +83,7 @@ def receive_upload(runtime: Runtime, file: IO[bytes], name: str, actor: str) -> 
 
         def admit(size_bytes: int) -> None:
             upload = UploadedFolder(folder=folder, created_by=actor, size_bytes=size_bytes)
-            with runtime.database.writing() as session:
-                serialize_writers(session)
+            with runtime.database.changing():
                 _require_share(runtime.settings, upload)
                 (partial / _CONTENT).mkdir(parents=True)
                 lock.enter_context(file_lock(partial / _LOCK))
@@ -98,7 +96,10 @@ def receive_upload(runtime: Runtime, file: IO[bytes], name: str, actor: str) -> 
             assert upload is not None, "it was admitted"
             upload = upload.model_copy(update=_count(partial / _CONTENT))
             _write_record(partial, upload)
-            partial.rename(partial.with_name(folder))
+            with runtime.database.changing() as session:
+                about = {"file": name[:200], "n_measurements": upload.n_measurements}
+                audit.record(session, actor, "upload.received", f"upload {folder}", **about)
+                partial.rename(partial.with_name(folder))
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
@@ -209,7 +210,7 @@ def delete_upload(runtime: Runtime, name: str, actor: str) -> None:
     ConflictError
         If a job is to import it.
     """
-    with runtime.database.writing() as session:
+    with runtime.database.changing() as session:
         upload = _set_aside(session, runtime.settings, name)
         audit.record(
             session, actor, "upload.deleted", f"upload {name}", size_bytes=upload.size_bytes
@@ -219,7 +220,6 @@ def delete_upload(runtime: Runtime, name: str, actor: str) -> None:
 
 def _set_aside(session: Session, settings: Settings, name: str) -> UploadedFolder:
     """Rename an upload so that nobody finds it; ConflictError if a job is to import it."""
-    serialize_writers(session)
     upload, job = find_upload(settings, name), import_of(session, [name]).get(name)
     if job is not None and job.state not in ENDED:
         raise ConflictError(f"job {job.id} imports the upload {name}; cancel it first")
@@ -242,12 +242,11 @@ def delete_unused_uploads(runtime: Runtime) -> None:
         job = jobs.get(upload.folder)
         if upload.created_at < before if job is None else job.state in ENDED:
             try:
-                with runtime.database.writing() as session:
+                with runtime.database.changing() as session:
                     _set_aside(session, settings, upload.folder)
             except (NotFoundError, ConflictError) as error:  # somebody was faster
                 logger.info("upload %s is not deleted: %s", upload.folder, error)
-    with runtime.database.writing() as session:
-        serialize_writers(session)  # a folder is locked before another process sees it
+    with runtime.database.changing():  # a folder is locked before another process sees it
         left = [path for path in _paths(settings) if path.name[0] == "." or _load(path) is None]
     _remove(left)
 

@@ -20,6 +20,7 @@ from service.store.photographs.measurements import (
 )
 from service.store.plant.geometry import (
     find_heliostat,
+    find_plant,
     find_receiver,
     find_target,
     get_heliostat,
@@ -61,7 +62,7 @@ from service.store.results import (
     study_findings,
     times_of_photographs,
 )
-from service.store.rows import Change, insert, serialize_writers
+from service.store.rows import Change, insert
 from service.store.surfaces.surface_versions import (
     NewSurface,
     Outdated,
@@ -100,6 +101,7 @@ __all__ = [
     "find_measured_surface",
     "find_measurement",
     "find_measurement_of_image",
+    "find_plant",
     "find_position",
     "find_receiver",
     "find_same_content",
@@ -146,7 +148,6 @@ __all__ = [
     "remove_receiver",
     "remove_target",
     "require_same_properties",
-    "serialize_writers",
     "stored_receiver",
     "stored_tower",
     "study_findings",

@@ -13,7 +13,7 @@ from service.base.errors import ConflictError, NotFoundError
 from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, AlarmRow
-from service.store.rows import assign, serialize_writers
+from service.store.rows import assign
 from service.store.tables import HeliostatRow
 
 
@@ -77,7 +77,6 @@ def acknowledge(
     NotFoundError
         If a heliostat was deleted.
     """
-    serialize_writers(session)
     held, ids = acknowledged(session), _heliostat_ids(session)
     rows = {key: held[key] for key in keys if key in held}
     new = {
@@ -127,7 +126,6 @@ def undo(session: Session, batch: int, actor: str) -> list[Key]:
     ConflictError
         If it was undone before.
     """
-    serialize_writers(session)
     rows = session.execute(_acknowledgements().where(AcknowledgementRow.batch == batch))
     found = {_key(name, row): row for name, row in rows}
     if not found:
@@ -228,7 +226,6 @@ def record_alarms(
 
     A recorded one that is not present ends at ``ended_at``, and remains if that is None.
     """
-    serialize_writers(session)
     held = {_key(name, row): row for name, row, _ in open_alarms(session)}
     ids = _heliostat_ids(session)
     for key in held.keys() - present.keys():

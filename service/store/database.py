@@ -20,6 +20,7 @@ import migrations
 from model.errors import InvalidInputError
 from service.base.errors import SchemaError, StoreDamagedError
 from service.base.settings import WEB_CONNECTIONS, Settings
+from service.store.rows import serialize_writers
 
 # Seconds that a writer waits for another on SQLite, and that connecting to PostgreSQL may take.
 _PATIENCE_S = 15
@@ -134,17 +135,31 @@ class Database:
             yield session
 
     def run_in_transaction(self, fn: Callable[[Session], Done]) -> Done:
-        """Return the function's result in a session of `writing`; retry it after a deadlock."""
+        """Return the result of a function that changes what people decide, in one transaction.
+
+        Such functions run one after another, on PostgreSQL as on SQLite, also those of other
+        services. What ``fn`` reads is therefore what it changes, a name is unique in two tables,
+        and changes of many things in different orders do not wait for each other. Transactions of
+        photographs and jobs do not wait here; `service.store.rows.lock_heliostat` orders them. If
+        PostgreSQL ends the transaction because of a deadlock with one of these, it begins again.
+        """
         for _ in range(_ATTEMPTS - 1):
             try:
-                with self.writing() as session:
+                with self.changing() as session:
                     return fn(session)
             except OperationalError as error:
                 if not is_deadlock(error):
                     raise
                 logger.info("a write and another waited for each other; it is begun again")
-        with self.writing() as session:
+        with self.changing() as session:
             return fn(session)
+
+    @contextmanager
+    def changing(self) -> Iterator[Session]:
+        """Open a session as `run_in_transaction` does, for one that is not tried again."""
+        with self.writing() as session:
+            serialize_writers(session)
+            yield session
 
     def upgrade(self, revision: str = "head") -> None:
         """Upgrade the schema to ``revision``."""

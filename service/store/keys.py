@@ -31,6 +31,9 @@ ITSELF = "the service"
 No key can have this name, because it contains a space. So no key can use its idempotency keys.
 """
 
+NOBODY = "without a key"
+"""The actor of refused logins. No key can have this name."""
+
 _KEY = re.compile(r"htw_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
 
@@ -97,6 +100,12 @@ def find(session: Session, presented: str) -> KeyRow | None:
     if row is None or not hmac.compare_digest(row.sha256, _sha256(presented)):
         return None
     return row
+
+
+def prefix_of(presented: str) -> str | None:
+    """The prefix of a presented key, which `list_keys` shows; None if it is malformed."""
+    match = _KEY.fullmatch(presented)
+    return None if match is None else match[1]
 
 
 def any_made(session: Session) -> bool:

@@ -20,11 +20,11 @@ _INSERTS: dict[str, Callable[..., Any]] = {"postgresql": postgresql.insert, "sql
 
 # Attempts of a writer that competes with others before it fails.
 ROUNDS = 8
-Named = TypeVar("Named", HeliostatRow, TargetRow, ReceiverRow)
-Row = TypeVar("Row", bound=Base)
 
 # Key of PostgreSQL's advisory lock in `serialize_writers`. Any constant will do.
-_PLANT_LOCK = 0x68656C69
+_CHANGES = 0x68656C69
+Named = TypeVar("Named", HeliostatRow, TargetRow, ReceiverRow)
+Row = TypeVar("Row", bound=Base)
 
 
 class Change(StrEnum):
@@ -50,16 +50,11 @@ class Put(NamedTuple, Generic[Row]):
 
 
 def serialize_writers(session: Session) -> None:
-    """Wait for other writers of the plant's configuration, and block them until the transaction
-    ends.
-
-    A name must be unique among targets and receivers, which no constraint of a single table can
-    ensure. The lock also prevents deadlocks between writers that set many things in different
-    orders. SQLite has only one writer anyway. The plant's row cannot be the lock, because targets
-    may be set before there is a plant.
+    """Wait for other changes (`Database.run_in_transaction`), and block them until the transaction
+    ends. SQLite has only one writer anyway.
     """
     if session.get_bind().dialect.name == "postgresql":
-        session.execute(select(func.pg_advisory_xact_lock(_PLANT_LOCK)))
+        session.execute(select(func.pg_advisory_xact_lock(_CHANGES)))
 
 
 def lock_row(session: Session, table: type[Base], number: int, name: str) -> None:
@@ -74,6 +69,22 @@ def lock_row(session: Session, table: type[Base], number: int, name: str) -> Non
     query = select(key).where(key == number).with_for_update(read=True, key_share=True)
     if session.scalar(query) is None:
         raise NotFoundError(f"{name} was deleted in the meantime")
+
+
+def lock_heliostat(session: Session, row: HeliostatRow) -> None:
+    """Wait for other writers of a heliostat's photographs and surfaces, and block them.
+
+    Lock it before reading what the transaction decides on. Rows that only refer to the heliostat
+    do not wait.
+
+    Raises
+    ------
+    NotFoundError
+        If it was deleted since it was read.
+    """
+    query = select(HeliostatRow.id).where(HeliostatRow.id == row.id)
+    if session.scalar(query.with_for_update(key_share=True)) is None:
+        raise NotFoundError(f"heliostat {row.name} was deleted in the meantime")
 
 
 def inserting(session: Session, table: type[Base]) -> Any:

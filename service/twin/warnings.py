@@ -9,7 +9,6 @@ from model.ephemeris import SunContradiction, clock_faults
 from model.frames import sun_direction
 from service.sources.photograph import Photograph
 from service.store.tables import SUN_CONTRADICTS_TIME, MeasurementRow
-from service.twin.heliostats.measurements import HeliostatContext
 
 Warnings = list[dict[str, object]]
 
@@ -48,13 +47,12 @@ def other_warnings(row: MeasurementRow, photograph: Photograph) -> Warnings:
 
 
 def sun_columns(
-    row: MeasurementRow, photograph: Photograph, twin: HeliostatContext
+    row: MeasurementRow, photograph: Photograph, contradiction: SunContradiction | None
 ) -> dict[str, object]:
     """The columns of a stored measurement that depend on its time and sun.
 
-    Time and sun are those of ``photograph``.
+    Time and sun are those of ``photograph``, with their ``contradiction``, if any.
     """
-    (contradiction,) = find_sun_contradictions([photograph], twin.origin)
     warnings = [*sun_warnings(contradiction), *other_warnings(row, photograph)]
     return {
         "quality": {**row.quality, "clock": contradiction and contradiction.detail},

@@ -61,5 +61,5 @@ def add(database: Database, *effects: dict[str, Any], **about: Any) -> int:
 
 
 def adopt(database: Database, study: int, force: bool = False) -> str:
-    with database.writing() as session:
+    with database.changing() as session:
         return model_versions.adopt(session, study, "tester", force).version

@@ -38,16 +38,34 @@ def made_from(session: Session, measurement: MeasurementRow) -> MadeFrom:
     return MadeFrom(tuple(versions), session.scalars(forecasts).one())
 
 
-def list_corrections(session: Session, measurement: MeasurementRow) -> Sequence[CorrectionRow]:
-    """The corrections of a photograph, oldest first."""
-    query = select(CorrectionRow).where(CorrectionRow.measurement_id == measurement.id)
+def list_corrections(
+    session: Session, measurement: MeasurementRow, after: int = 0
+) -> Sequence[CorrectionRow]:
+    """The corrections of a photograph after number ``after``, oldest first."""
+    query = select(CorrectionRow).where(
+        CorrectionRow.measurement_id == measurement.id, CorrectionRow.id > after
+    )
     return session.scalars(query.order_by(CorrectionRow.id)).all()
 
 
-def delete_drift(session: Session, measurement: MeasurementRow) -> None:
-    """Delete the photograph's accuracy on arrival, because its metadata were wrong."""
-    measurement.forecast_accuracy = None
-    session.execute(delete(DriftRow).where(DriftRow.measurement_id == measurement.id))
+def newest_correction(session: Session, measurement: MeasurementRow | None = None) -> int:
+    """Number of the newest correction of a photograph, or of all: the version of what is shown.
+
+    Read it before what is shown.
+    """
+    query = select(func.max(CorrectionRow.id))
+    if measurement is not None:
+        images = images_of_photograph(session, measurement).values()
+        query = query.where(CorrectionRow.measurement_id.in_([image.id for image in images]))
+    return session.scalar(query) or 0
+
+
+def delete_drift(session: Session, measurements: Sequence[MeasurementRow]) -> None:
+    """Delete the accuracies on arrival of photographs, because their metadata were wrong."""
+    for measurement in measurements:
+        measurement.forecast_accuracy = None
+    numbers = [measurement.id for measurement in measurements]
+    session.execute(delete(DriftRow).where(DriftRow.measurement_id.in_(numbers)))
 
 
 def note_change(session: Session, heliostat: int) -> None:

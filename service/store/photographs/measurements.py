@@ -13,7 +13,7 @@ from service.store import sizes
 from service.store.columns import now
 from service.store.listing import EVER, Order, Period, select_after
 from service.store.plant.geometry import get_target
-from service.store.rows import ROUNDS, Added, insert, lock_row
+from service.store.rows import ROUNDS, Added, insert, lock_heliostat, lock_row
 from service.store.tables import (
     NO_IMAGE,
     AliasRow,
@@ -335,7 +335,7 @@ def _check_and_lock(session: Session, heliostat: HeliostatRow, row: MeasurementR
     """Check the id of a new measurement, and lock its heliostat and its target."""
     if row.external_id is not None:
         names.require_name(names.IDENTIFIER, row.external_id, "id")
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    lock_heliostat(session, heliostat)
     lock_row(session, TargetRow, row.target_id, "its target")
 
 

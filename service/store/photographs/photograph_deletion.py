@@ -11,10 +11,10 @@ from service.store.photographs import image_retention
 from service.store.photographs.correction_log import delete_drift, made_from, note_change
 from service.store.photographs.measurements import get_measurement, images_of_photograph
 from service.store.plant.geometry import get_heliostat
+from service.store.rows import lock_heliostat
 from service.store.tables import (
     AliasRow,
     CorrectionRow,
-    HeliostatRow,
     MeasurementRow,
     SurfaceRow,
     surface_measurements,
@@ -49,15 +49,13 @@ def delete_photograph(
         If the heliostat or measurement is not stored.
     """
     owner = get_heliostat(session, heliostat)
-    # Writers of its photographs or surfaces lock this row.
-    session.execute(select(HeliostatRow.id).where(HeliostatRow.id == owner.id).with_for_update())
+    lock_heliostat(session, owner)
     row = get_measurement(session, owner, identifier)
     derived = made_from(session, row)
     every = [row] if only_this else images_of_photograph(session, row).values()
     rows = sorted(every, key=lambda image: image.id)  # in the order in which they came
     _name_in_surfaces(session, rows)
-    for image in rows:
-        delete_drift(session, image)
+    delete_drift(session, rows)
     numbers = [image.id for image in rows]
     session.execute(delete(CorrectionRow).where(CorrectionRow.measurement_id.in_(numbers)))
     session.execute(delete(AliasRow).where(AliasRow.measurement_id.in_(numbers)))

@@ -14,23 +14,20 @@ from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import JsonObject
 from service.base.plant_facts import PlantFacts
 from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json
-from service.store.rows import (
-    Change,
-    Put,
-    assign,
-    floats,
-    insert,
-    insert_or_find,
-    serialize_writers,
-)
+from service.store.rows import Change, Put, assign, floats, insert, insert_or_find
 from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
 
 _NEW_PLANT = "heliotwin.new_plant"
 
 
+def find_plant(session: Session) -> PlantRow | None:
+    """The plant, or None."""
+    return session.get(PlantRow, 1)
+
+
 def get_plant(session: Session) -> PlantRow:
     """The plant; ConflictError if it is not set."""
-    plant = session.get(PlantRow, 1)
+    plant = find_plant(session)
     if plant is None:
         raise ConflictError(
             "the plant is not set yet: PUT its PAINT tower measurements to /v1/plant, or import a"
@@ -47,7 +44,6 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
     ConflictError
         If heliostats or targets are already stored relative to another origin.
     """
-    serialize_writers(session)
     latitude, longitude, altitude = floats(origin)
     values = {
         "name": name,
@@ -163,7 +159,6 @@ def put_heliostat(
         concurrent writer.
     """
     names.require_name(names.NAME, name, "heliostat")
-    serialize_writers(session)
     east, north, up = floats(position)
     values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
     row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
@@ -209,7 +204,6 @@ def put_target(
         If a receiver has this name.
     """
     names.require_name(names.NAME, plane.name, "target")
-    serialize_writers(session)
     if find_receiver(session, plane.name) is not None:
         raise ConflictError(
             f"name: {plane.name} is a receiver; choose another name for the target plane"
@@ -292,7 +286,6 @@ def put_receiver(session: Session, receiver: Receiver) -> Put[ReceiverRow]:
     """
     names.require_name(names.NAME, receiver.name, "receiver")
     document = receiver_to_json(receiver)
-    serialize_writers(session)
     if find_target(session, receiver.name) is not None:
         raise ConflictError(
             f"name: {receiver.name} is a target plane; choose another name for the receiver"

@@ -14,7 +14,7 @@ from model.effects import Effect, effect_to_json, model_version
 from service.base.errors import ConflictError
 from service.store.keys import RESERVED
 from service.store.plant.geometry import get_plant, is_plant_new
-from service.store.rows import Change, insert, serialize_writers
+from service.store.rows import Change, insert
 from service.store.tables import ModelRow, PlantRow, StudyRow
 
 DECLARED = 1
@@ -84,7 +84,6 @@ def put_declared(session: Session, declared: dict[str, object], actor: str = RES
     ConflictError
         If studies used another declaration, because their results add to that one.
     """
-    serialize_writers(session)
     plant = get_plant(session)
     if (declared_of(session, find_current(session)) or {}) == declared:
         return Change.UNCHANGED

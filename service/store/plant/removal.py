@@ -8,7 +8,6 @@ from service.store.columns import Base
 from service.store.job_tables import AcknowledgementRow, AlarmRow, JobRow
 from service.store.jobs.queue import ENDED
 from service.store.plant.geometry import get_heliostat, get_receiver, get_target
-from service.store.rows import serialize_writers
 from service.store.tables import (
     DecisionRow,
     DriftRow,
@@ -34,7 +33,6 @@ def remove_target(session: Session, name: str) -> None:
     ConflictError
         If something refers to it. The message lists what.
     """
-    serialize_writers(session)
     row = get_target(session, name)
     _lock(session, TargetRow, row.id)
     users = {
@@ -46,14 +44,12 @@ def remove_target(session: Session, name: str) -> None:
 
 def remove_receiver(session: Session, name: str) -> None:
     """Delete a receiver. Raises the errors of `remove_target`."""
-    serialize_writers(session)
     row = get_receiver(session, name)
     _delete_unused(session, row, f"receiver {name}", _users_of_name(session, name))
 
 
 def remove_heliostat(session: Session, name: str) -> None:
     """Delete a heliostat. Raises the errors of `remove_target`."""
-    serialize_writers(session)
     row = get_heliostat(session, name)
     _lock(session, HeliostatRow, row.id)
     users = {

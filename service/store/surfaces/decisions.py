@@ -11,8 +11,9 @@ from service.base.errors import ConflictError
 from service.store import audit
 from service.store.columns import EPOCH, now
 from service.store.listing import NEWEST_FIRST, select_after
-from service.store.rows import lock_row
-from service.store.surfaces.surface_versions import find_surface_at
+from service.store.plant.geometry import get_heliostat
+from service.store.rows import lock_heliostat
+from service.store.surfaces.surface_versions import find_surface_at, get_surface
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 
 
@@ -81,7 +82,7 @@ def promote(
     grounds: Justification,
 ) -> DecisionRow:
     """Make a version active. Versions that would take precedence over it become candidates."""
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    lock_heliostat(session, heliostat)
     row = _record(session, heliostat, surface, True, actor, grounds)
     place = _sort_key(surface)
     for other in session.scalars(select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)):
@@ -106,18 +107,74 @@ def reject(
     return row
 
 
-def undo_decision(session: Session, heliostat: HeliostatRow, actor: str) -> DecisionRow:
+def decide(
+    session: Session,
+    name: str,
+    version: int,
+    became_active: bool,
+    actor: str,
+    reason: str,
+    shown: int | None = None,
+) -> DecisionRow:
+    """Make a version of a heliostat active, or keep the active one instead of this candidate.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such heliostat or version.
+    ConflictError
+        If the version to reject is no candidate, or as in `undo_decision`.
+    """
+    heliostat = get_heliostat(session, name)
+    lock_heliostat(session, heliostat)
+    _require_active(session, heliostat, shown)
+    surface = get_surface(session, heliostat, version)
+    if not (became_active or surface.is_candidate):
+        raise ConflictError(f"version {version} of {name} is no candidate; reload the page")
+    change = promote if became_active else reject
+    return change(session, heliostat, surface, actor, Justification(reason))
+
+
+def _require_active(session: Session, heliostat: HeliostatRow, shown: int | None) -> None:
+    """Require that the version ``shown`` is active, 0 for none; None requires nothing."""
+    active = find_surface_at(session, heliostat)
+    version = 0 if active is None else active.version
+    if shown in (None, version):
+        return
+    query = select(DecisionRow).where(DecisionRow.heliostat_id == heliostat.id)
+    last = session.scalar(query.order_by(DecisionRow.id.desc()).limit(1))
+    by = "" if last is None else f" by {last.created_by} ({last.reason})"
+    raise ConflictError(
+        f"heliostat {heliostat.name}: the active surface was changed from version {shown} to"
+        f" {version}{by} since it was read; read it again before you decide"
+    )
+
+
+def undo_decision(
+    session: Session,
+    heliostat: HeliostatRow,
+    actor: str,
+    shown: int | None = None,
+    decision: int | None = None,
+) -> DecisionRow:
     """Undo the decision of `find_undoable`, so that the previous surface is active again.
 
-    A second undo reverses the first.
+    A second undo reverses the first. ``shown`` is the version that was active when it was read, and
+    ``decision`` the number of the decision to undo; None requires nothing.
 
     Raises
     ------
     ConflictError
-        If there is no such decision.
+        If there is no such decision, or another surface is active.
     """
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    lock_heliostat(session, heliostat)
+    _require_active(session, heliostat, shown)
     last = find_undoable(session, heliostat)
+    if last is not None and decision not in (None, last.id):
+        raise ConflictError(
+            f"heliostat {heliostat.name}: {last.created_by} decided on version"
+            f" {last.surface.version} since ({last.reason}); reload the page before you undo"
+        )
     if last is None or last.previous is None:
         raise ConflictError(
             f"heliostat {heliostat.name}: no decision took another surface's place; choose a"

@@ -16,7 +16,7 @@ from service.base.arrays import pack, unpack
 from service.base.errors import ConflictError, NotFoundError
 from service.store.columns import EPOCH, UtcDateTime, now
 from service.store.listing import EVER, Order, Period, select_after
-from service.store.rows import ROUNDS, Added, insert, lock_row
+from service.store.rows import ROUNDS, Added, insert, lock_heliostat
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 
 # Tolerance for equal heights [m]. Threads that sum in a different order differ by less.
@@ -137,7 +137,7 @@ def add_surface(
     NotFoundError
         If the heliostat was deleted since it was read.
     """
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
+    lock_heliostat(session, heliostat)
     content = new.content if once else None
     for _ in range(ROUNDS):
         if content is not None:

@@ -1,7 +1,7 @@
 """Acknowledging alarms together, and undoing that."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -11,9 +11,11 @@ from service import store
 from service.base.errors import ConflictError, NotFoundError
 from service.store import acknowledgements
 from service.store.columns import now
+from service.store.job_tables import AcknowledgementRow
+from service.store.rows import lock_heliostat
 from service.store.surfaces import decisions
 from service.store.tables import HeliostatRow, SurfaceRow
-from service.twin.alarms.alarms import Alarm, AlarmList, find_untrusted
+from service.twin.alarms.alarms import Alarm, AlarmList, find_untrusted, untrusted_fingerprint
 from service.twin.alarms.field_overview import read_summaries
 from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.runtime.runtime import Runtime
@@ -110,13 +112,15 @@ def acknowledge(
             f"ids: {missing[0]} is not an alarm, or its reason changed; see /v1/alarms"
         )
     chosen = [items[number] for number in ids]
-    with runtime.database.writing() as session:
+
+    def write(session: Session) -> list[AcknowledgementRow]:
         rows = acknowledgements.acknowledge(session, [item.key for item in chosen], actor, comment)
-        for item in chosen:
-            if item.reason == "untrusted":
-                heliostat = store.get_heliostat(session, item.heliostat or "")
-                surface = _flagged_surface(session, heliostat)
+        for key in (item.key for item in chosen if item.reason == "untrusted"):
+            for heliostat, surface in _untrusted(session, key):
                 decisions.acknowledge_warnings(session, heliostat, surface, actor)
+        return rows
+
+    rows = runtime.database.run_in_transaction(write)
     return [item.with_acknowledgement(row) for item, row in zip(chosen, rows, strict=True)]
 
 
@@ -130,8 +134,10 @@ def acknowledge_surface(
     ConflictError
         If there is no such alarm, or it is about another version.
     """
-    with runtime.database.writing() as session:
+
+    def write(session: Session) -> None:
         heliostat = store.get_heliostat(session, name)
+        lock_heliostat(session, heliostat)
         surface = store.get_surface(session, heliostat, version)
         (line,) = read_summaries(session, heliostat.id)
         alarm = find_untrusted(line, now())
@@ -143,15 +149,30 @@ def acknowledge_surface(
         acknowledgements.acknowledge(session, [alarm.key], actor, comment)
         decisions.acknowledge_warnings(session, heliostat, surface, actor)
 
+    runtime.database.run_in_transaction(write)
+
 
 def undo_acknowledgement(runtime: Runtime, batch: int, actor: str) -> None:
     """Undo the acknowledgements of a batch. Raises the errors of `acknowledgements.undo`."""
-    with runtime.database.writing() as session:
+
+    def write(session: Session) -> None:
         for key in acknowledgements.undo(session, batch, actor):
             if key.reason == "untrusted":
-                heliostat = store.get_heliostat(session, key.heliostat or "")
-                surface = _flagged_surface(session, heliostat)
-                decisions.forget_acknowledgement(session, heliostat, surface, actor)
+                for heliostat, surface in _untrusted(session, key):
+                    decisions.forget_acknowledgement(session, heliostat, surface, actor)
+
+    runtime.database.run_in_transaction(write)
+
+
+def _untrusted(
+    session: Session, key: acknowledgements.Key
+) -> Iterator[tuple[HeliostatRow, SurfaceRow]]:
+    """The surface versions that an alarm "untrusted" is about, which have the same warnings."""
+    heliostat = store.get_heliostat(session, key.heliostat or "")
+    lock_heliostat(session, heliostat)
+    for surface in store.list_surfaces(session, heliostat, None):
+        if surface.warnings and untrusted_fingerprint(surface) == key.fingerprint:
+            yield heliostat, surface
 
 
 def _flagged_surface(session: Session, heliostat: HeliostatRow) -> SurfaceRow:

@@ -39,8 +39,9 @@ from service.store.tables import (
     MountRow,
     PlantRow,
     StudyRow,
+    SurfaceRow,
 )
-from service.twin.alarms.field_overview import HeliostatOverview, read_marks
+from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
 from service.twin.alarms.light import LostLight, find_lost_light
 from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
@@ -179,7 +180,7 @@ def find_untrusted(line: HeliostatOverview, at: datetime) -> Alarm | None:
         return None
     since = surface.warned_since or surface.created_at or at
     photographs = tuple(surface.suspicious or ())
-    which = f"photograph{'s' if len(photographs) > 1 else ''} {', '.join(photographs)}"
+    which = _named(photographs)
     return Alarm(
         "untrusted",
         line.name,
@@ -187,11 +188,22 @@ def find_untrusted(line: HeliostatOverview, at: datetime) -> Alarm | None:
         "; ".join(surface.warnings or ()),
         f"look at {which if photographs else 'its photographs'}, exclude what is wrong, and predict"
         " its surface again",
-        f"{since.isoformat()} {hashlib.sha256(which.encode()).hexdigest()[:8]}",
+        untrusted_fingerprint(surface),
         surface.acknowledged_by,
         surface.acknowledged_at,
         photographs,
     )
+
+
+def _named(photographs: Sequence[str]) -> str:
+    return f"photograph{'s' if len(photographs) > 1 else ''} {', '.join(photographs)}"
+
+
+def untrusted_fingerprint(surface: ActiveSurface | SurfaceRow) -> str:
+    """Fingerprint of the alarm that a surface is not trusted; a repeated prediction keeps it."""
+    since, which = surface.warned_since or surface.created_at, _named(surface.suspicious or ())
+    began = "" if since is None else since.isoformat()
+    return f"{began} {hashlib.sha256(which.encode()).hexdigest()[:8]}"
 
 
 def _pointing(

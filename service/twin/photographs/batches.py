@@ -1,24 +1,26 @@
 """Corrections of many photographs: a preview, all or none, and undo."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import TypeVar
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from model.errors import ModelError
+from model.times import format_time
 from service.base.errors import ConflictError, InvalidEntriesError, NotFoundError, ServiceError
 from service.store import audit
 from service.store.job_tables import AuditRow
-from service.store.rows import Change
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
-from service.twin.heliostats.metadata import photograph_from_row, stored_metadata
+from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.photographs.corrections import (
+    Corrections,
+    GivenCorrection,
     PhotographChanges,
-    PreparedCorrection,
-    apply_correction,
-    prepare_correction,
+    Prepared,
+    run_corrections,
 )
 from service.twin.photographs.ingest import require_past
 from service.twin.runtime.runtime import Runtime
@@ -31,15 +33,7 @@ TIMES, MOTORS = "times.corrected", "motors.corrected"
 
 _UNDONE = {TIMES: "times.undone", MOTORS: "motors.undone"}
 _FIELDS = ("taken_at", "motor_position")
-
-
-@dataclass(frozen=True)
-class GivenCorrection:
-    """The corrected metadata of a heliostat's measurement."""
-
-    heliostat: str
-    identifier: str
-    changes: PhotographChanges
+Done = TypeVar("Done")
 
 
 @dataclass(frozen=True)
@@ -51,47 +45,39 @@ class CorrectionPreview:
     warning: str | None
 
 
-def _prepare(
-    runtime: Runtime, where: str, given: Sequence[GivenCorrection]
-) -> list[PreparedCorrection]:
-    prepared: list[PreparedCorrection] = []
+def _each(
+    where: str, given: Sequence[GivenCorrection], correct: Callable[[GivenCorrection], Done]
+) -> list[Done]:
+    """The result for each entry; InvalidEntriesError names all that cannot be corrected."""
+    done: list[Done] = []
     wrong: dict[int, str] = {}
-    named: set[tuple[str, str]] = set()
     for place, entry in enumerate(given):
         try:
             require_past(entry.changes.taken_at)
-            ready = prepare_correction(runtime, entry.heliostat, entry.identifier, entry.changes)
+            done.append(correct(entry))
         except (ModelError, ServiceError) as error:
             wrong[place] = str(error)
-            continue
-        images = {(entry.heliostat, name) for name in ready.fresh}
-        if named & images:
-            wrong[place] = (
-                f"measurement {entry.identifier} of {entry.heliostat} is named twice; name it once"
-            )
-        named |= images
-        prepared.append(ready)
     if wrong:
         raise InvalidEntriesError(where, wrong)
-    return prepared
+    return done
 
 
 def preview_many(
-    runtime: Runtime, where: str, given: Sequence[GivenCorrection]
+    session: Session, where: str, given: Sequence[GivenCorrection]
 ) -> list[CorrectionPreview]:
     """What `correct_many` would change; raises its errors, and stores nothing."""
-    return [
-        CorrectionPreview(entry, ready.row, _contradiction(ready))
-        for entry, ready in zip(given, _prepare(runtime, where, given), strict=True)
-        if entry.changes.of(ready.row) != photograph_from_row(ready.row)
-    ]
+    corrections = Corrections(session, "", Prepared())
 
+    def preview(entry: GivenCorrection) -> CorrectionPreview | None:
+        row = corrections.find(entry)
+        if entry.changes.of(row) == photograph_from_row(row):
+            return None
+        columns = corrections.columns.of(row, entry.changes)
+        quality = columns["quality"] if columns else {}
+        assert isinstance(quality, dict)
+        return CorrectionPreview(entry, row, quality.get("clock"))
 
-def _contradiction(ready: PreparedCorrection) -> str | None:
-    quality = next(iter(ready.fresh.values()))["quality"]
-    assert isinstance(quality, dict)
-    clock = quality.get("clock")
-    return clock if isinstance(clock, str) else None
+    return [one for one in _each(where, given, preview) if one is not None]
 
 
 def correct_many(
@@ -100,7 +86,7 @@ def correct_many(
     reason: str,
     actor: str,
     action: str,
-    **about: int,
+    version: int | None = None,
 ) -> int:
     """Correct many photographs for one ``reason``, all or none; return how many changed.
 
@@ -113,24 +99,34 @@ def correct_many(
         If a heliostat or measurement is not stored, a measurement is named twice, a time is in the
         future, or an image that must be re-measured is deleted. The error names all wrong entries.
     ConflictError
-        If another image of a photograph came meanwhile.
+        If a value changed since ``version``, as in `correct_photograph`.
     """
-    prepared = _prepare(runtime, action.partition(".")[0], given)
-    with runtime.database.writing() as session:
-        last = session.scalar(select(func.max(CorrectionRow.id))) or 0
-        changes = [apply_correction(session, entry, actor).change for entry in prepared]
-        changed = changes.count(Change.CHANGED)
-        made = session.execute(
-            select(func.min(CorrectionRow.id), func.max(CorrectionRow.id)).where(
-                CorrectionRow.id > last,
-                CorrectionRow.created_by == actor,
-                CorrectionRow.reason == reason,
-            )
-        ).one()
-        if changed:
-            span = {"first": made[0], "last": made[1], "reason": reason}
-            audit.record(session, actor, action, f"{changed} photographs", **span, **about)
-    return changed
+
+    def write(corrections: Corrections) -> int:
+        return _correct_all(corrections, given, reason, action)
+
+    return run_corrections(runtime, actor, write, version)
+
+
+def _correct_all(
+    corrections: Corrections,
+    given: Sequence[GivenCorrection],
+    reason: str,
+    action: str,
+    **about: int,
+) -> int:
+    """Correct many photographs, and record them together."""
+    corrections.lock(entry.heliostat for entry in given)
+    done = _each(action.partition(".")[0], given, corrections.apply)
+    history = [entry for corrected in done for entry in corrected.history]
+    count = sum(bool(corrected.history) for corrected in done)
+    if history:
+        corrections.session.flush()
+        numbers = [entry.id for entry in history]
+        about |= {"first": min(numbers), "last": max(numbers)}
+        subject, actor = f"{count} photographs", corrections.actor
+        audit.record(corrections.session, actor, action, subject, reason=reason, **about)
+    return count
 
 
 def list_batches(session: Session, limit: int) -> list[tuple[AuditRow, bool]]:
@@ -138,10 +134,15 @@ def list_batches(session: Session, limit: int) -> list[tuple[AuditRow, bool]]:
     row = AuditRow
     query = select(row).order_by(row.id.desc())
     rows = session.scalars(query.where(row.action.in_(_UNDONE)).limit(limit)).all()
-    first = min((one.id for one in rows), default=0)
-    undone = session.scalars(query.where(row.action.in_(_UNDONE.values()), row.id > first))
-    numbers = {one.detail.get("undone") for one in undone}
-    return [(one, one.id in numbers) for one in rows]
+    undone = _undone_by(session, rows)
+    return [(one, one.id in undone) for one in rows]
+
+
+def _undone_by(session: Session, rows: Sequence[AuditRow]) -> dict[int, AuditRow]:
+    """The entries that undid these or later ones, by what they undid."""
+    first = min((row.id for row in rows), default=0)
+    undone = select(AuditRow).where(AuditRow.action.in_(_UNDONE.values()), AuditRow.id > first)
+    return {row.detail["undone"]: row for row in session.scalars(undone)}
 
 
 def undo_batch(runtime: Runtime, number: int, actor: str) -> int:
@@ -156,38 +157,59 @@ def undo_batch(runtime: Runtime, number: int, actor: str) -> int:
     ConflictError
         If it is undone already, or everything was corrected again.
     """
-    with runtime.database.reading() as session:
+
+    def write(corrections: Corrections) -> int:
+        session = corrections.session
         entry = session.get(AuditRow, number)
         if entry is None or entry.action not in _UNDONE:
             raise NotFoundError(f"there is no correction of many photographs {number}")
+        if (undone := _undone_by(session, [entry]).get(number)) is not None:
+            raise ConflictError(
+                f"correction {number} was undone by {undone.actor} on"
+                f" {format_time(undone.created_at)}; it cannot be undone again"
+            )
         reason = f"undone: {entry.detail['reason']}"[:200]
-        done, measured = CorrectionRow, MeasurementRow
-        found = session.execute(
-            select(done, measured, HeliostatRow.name)
-            .join(measured, measured.id == done.measurement_id)
-            .join(HeliostatRow, HeliostatRow.id == measured.heliostat_id)
-            .where(
-                done.id.between(entry.detail["first"], entry.detail["last"]),
-                done.created_by == entry.actor,
-                done.reason == entry.detail["reason"],
+        given = _restoring_all(session, entry, reason)
+        if not given:
+            raise ConflictError(
+                f"all photographs of correction {number} were corrected again since; nothing was"
+                " undone"
             )
-        ).all()
-        given = {
-            (name, row.external_id or row.identifier): GivenCorrection(
-                name, row.identifier, _restoring(correction, reason)
-            )
-            for correction, row, name in found
-            if all(
-                stored_metadata(row)[field] == correction.after[field]
-                for field in _FIELDS
-                if field in correction.after
-            )
-        }
-    if not given:
-        raise ConflictError(f"correction {number} is undone, or all was corrected again")
-    return correct_many(
-        runtime, list(given.values()), reason, actor, _UNDONE[entry.action], undone=number
-    )
+        return _correct_all(corrections, given, reason, _UNDONE[entry.action], undone=number)
+
+    return run_corrections(runtime, actor, write)
+
+
+def _restoring_all(session: Session, entry: AuditRow, reason: str) -> list[GivenCorrection]:
+    """The corrections that restore what was before ``entry``, unless it changed since."""
+    done, newer = CorrectionRow, aliased(CorrectionRow)
+    row, name = MeasurementRow, HeliostatRow.name
+    found = session.execute(
+        select(done, row.identifier, func.coalesce(row.external_id, row.identifier), name)
+        .join(row, row.id == done.measurement_id)
+        .join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
+        .where(
+            done.id.between(entry.detail["first"], entry.detail["last"]),
+            done.created_by == entry.actor,
+            done.reason == entry.detail["reason"],
+        )
+    ).all()
+    since = select(newer.measurement_id, newer.after).where(newer.id > entry.detail["last"])
+    numbers = [correction.measurement_id for correction, *_ in found]
+    rows = session.execute(since.where(newer.measurement_id.in_(numbers)))
+    changed = {(measurement, field) for measurement, after in rows for field in after}
+    given = {
+        (heliostat, photograph): GivenCorrection(
+            heliostat, identifier, _restoring(correction, reason)
+        )
+        for correction, identifier, photograph, heliostat in found
+        if not any(
+            (correction.measurement_id, field) in changed
+            for field in _FIELDS
+            if field in correction.after
+        )
+    }
+    return list(given.values())
 
 
 def _restoring(correction: CorrectionRow, reason: str) -> PhotographChanges:

@@ -3,29 +3,39 @@
 A change applies to all images of the photograph.
 """
 
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
+from typing import NamedTuple, TypeVar
 
 from sqlalchemy.orm import Session
 
-from model.imaging.light import camera_at
+from model.ephemeris import SunContradiction
+from model.errors import InvalidInputError
+from model.imaging.light import Camera, camera_at
 from model.pointing import Weather
 from service import store
-from service.base.errors import ConflictError, GoneError
-from service.base.fields import Sun
+from service.base.errors import ConflictError, GoneError, NotFoundError
+from service.base.fields import JsonObject
 from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.columns import now
-from service.store.photographs.correction_log import delete_drift
+from service.store.photographs.correction_log import (
+    delete_drift,
+    list_corrections,
+    newest_correction,
+)
 from service.store.photographs.image_files import digest
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
-from service.store.rows import Change, Put, lock_row
+from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
-from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
 from service.twin.heliostats.metadata import photograph_from_row, stored_metadata
-from service.twin.photographs.ingest import measure_stored, measurement_row
+from service.twin.photographs.ingest import measure_photograph, measurement_row
+from service.twin.plant.model_versions import get_model
 from service.twin.runtime.runtime import Runtime
 from service.twin.warnings import find_sun_contradictions, other_warnings, sun_columns
+
+Done = TypeVar("Done")
 
 # Columns that a new measurement of the image changes: metadata, weather and measured values.
 _METADATA = (
@@ -38,7 +48,8 @@ _METADATA = (
     "warnings",
 )
 _WEATHER = tuple(weather.name for weather in fields(Weather))
-_MEASURED = ("target_id", "accepted", "reason", "center_right_m", "center_up_m", "arrays")
+_MEASURED = ("accepted", "reason", "center_right_m", "center_up_m", "arrays")
+_PLANE = ("name", "center_m", "normal", "up", "width_m", "height_m", "locator")
 
 
 class NothingToChangeError(ConflictError):
@@ -55,7 +66,8 @@ class PhotographChanges:
 
     reason: str
     target_name: str | None = None
-    sun: Sun | None = None
+    azimuth_deg: float | None = None
+    elevation_deg: float | None = None
     taken_at: datetime | None = None
     motor_position: tuple[float, float] | None = None
     weather: Weather = field(default_factory=Weather)
@@ -64,21 +76,45 @@ class PhotographChanges:
 
     def of(self, row: MeasurementRow) -> Photograph:
         """The stored photograph with the changes applied."""
-        names = ("target_name", "sun", "taken_at", "motor_position")
+        names = ("target_name", "taken_at", "motor_position")
         stored = photograph_from_row(row)
+        angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
+        sun = {name: value for name, value in angles.items() if value is not None}
         weather = {name: value for name, value in vars(self.weather).items() if value is not None}
         changes = {name: value for name in names if (value := getattr(self, name)) is not None}
         changes |= dict.fromkeys(self.without)
+        changes["sun"] = stored.sun.model_copy(update=sun)
         return replace(stored, weather=replace(stored.weather, **weather), **changes)
 
 
+@dataclass(frozen=True)
+class GivenCorrection:
+    """The corrected metadata of a heliostat's measurement."""
+
+    heliostat: str
+    identifier: str
+    changes: PhotographChanges
+
+
+class Corrected(NamedTuple):
+    """The named image of a corrected photograph, and the new entries of its images' histories."""
+
+    row: MeasurementRow
+    history: list[CorrectionRow]
+
+
 def correct_photograph(
-    runtime: Runtime, heliostat: str, identifier: str, changes: PhotographChanges, actor: str
-) -> MeasurementRow:
-    """Correct or exclude the photograph of an image, and return the image's row.
+    runtime: Runtime,
+    heliostat: str,
+    identifier: str,
+    changes: PhotographChanges,
+    actor: str,
+    version: int | None = None,
+) -> Corrected:
+    """Correct or exclude the photograph of an image.
 
     All images of the photograph are changed. They are re-measured if their target or camera
-    changes.
+    changes. Only the named fields are written.
 
     Raises
     ------
@@ -87,73 +123,30 @@ def correct_photograph(
     NothingToChangeError
         If nothing would change.
     ConflictError
-        If another image of the photograph came meanwhile.
+        If one of the fields changed since ``version`` of the history (`newest_correction`).
     GoneError
         If an image must be re-measured, but is deleted.
     """
-    prepared = prepare_correction(runtime, heliostat, identifier, changes)
-    with runtime.database.writing() as session:
-        row, change = apply_correction(session, prepared, actor)
-        if change is Change.UNCHANGED:
+    given = GivenCorrection(heliostat, identifier, changes)
+    return correct_photographs(runtime, [given], actor, version)[0]
+
+
+def correct_photographs(
+    runtime: Runtime, given: Sequence[GivenCorrection], actor: str, version: int | None = None
+) -> list[Corrected]:
+    """Correct or exclude photographs, all or none; raises what `correct_photograph` raises."""
+
+    def write(corrections: Corrections) -> list[Corrected]:
+        corrections.lock(entry.heliostat for entry in given)
+        done = [corrections.apply(entry) for entry in given]
+        if corrections.is_complete and not any(corrected.history for corrected in done):
+            names = ", ".join(entry.identifier for entry in given)
             raise NothingToChangeError(
-                f"measurement {identifier} has these values already; nothing changed"
+                f"measurement {names} has these values already; nothing changed"
             )
-    return row
+        return done
 
-
-@dataclass(frozen=True, eq=False)
-class PreparedCorrection:
-    """A correction before it is written.
-
-    ``fresh`` are the columns to write, by identifier of the photograph's images. ``row`` is the
-    stored image that was named.
-    """
-
-    heliostat: str
-    identifier: str
-    changes: PhotographChanges
-    fresh: dict[str, dict[str, object]]
-    row: MeasurementRow
-
-
-def prepare_correction(
-    runtime: Runtime, heliostat: str, identifier: str, changes: PhotographChanges
-) -> PreparedCorrection:
-    """The new columns of a photograph; raises the errors of `correct_photograph`."""
-    with runtime.database.reading() as session:
-        twin = load_heliostat_context(session, heliostat)
-        row = store.get_measurement(session, twin.row, identifier)
-        images = images_of_photograph(session, row)
-        named = (
-            None if changes.target_name is None else store.get_target(session, changes.target_name)
-        )
-    fresh = {
-        row.identifier: _new_values(runtime, twin, row, changes.of(row), named or row.target)
-        for row in images.values()
-    }
-    return PreparedCorrection(heliostat, identifier, changes, fresh, row)
-
-
-def apply_correction(
-    session: Session, prepared: PreparedCorrection, actor: str
-) -> Put[MeasurementRow]:
-    """Write a correction to all images of a photograph, and return that of the prepared one."""
-    heliostat, identifier, changes = prepared.heliostat, prepared.identifier, prepared.changes
-    row_of_heliostat = store.get_heliostat(session, heliostat)
-    lock_row(session, HeliostatRow, row_of_heliostat.id, f"heliostat {heliostat}")
-    row = store.get_measurement(session, row_of_heliostat, identifier, arrays=True)
-    images = {
-        one.identifier: one for one in images_of_photograph(session, row, arrays=True).values()
-    }
-    if images.keys() != prepared.fresh.keys():
-        raise ConflictError(
-            f"measurement {identifier}: another image of it came meanwhile; correct it again"
-        )
-    has_changed = [
-        _log_correction(session, heliostat, one, prepared.fresh[name], changes, actor)
-        for name, one in images.items()
-    ]
-    return Put(row, Change.CHANGED if any(has_changed) else Change.UNCHANGED)
+    return run_corrections(runtime, actor, write, version)
 
 
 def remeasure(runtime: Runtime, heliostat: str, identifier: str, reason: str, actor: str) -> bool:
@@ -166,111 +159,302 @@ def remeasure(runtime: Runtime, heliostat: str, identifier: str, reason: str, ac
     GoneError
         If the image is deleted.
     """
+
+    def write(corrections: Corrections) -> bool:
+        corrections.lock([heliostat])
+        given = GivenCorrection(heliostat, identifier, PhotographChanges(reason))
+        return bool(corrections.remeasure(given).history)
+
+    return run_corrections(runtime, actor, write)
+
+
+def run_corrections(
+    runtime: Runtime, actor: str, write: Callable[["Corrections"], Done], version: int | None = None
+) -> Done:
+    """Run ``write`` in one transaction, in which it corrects photographs.
+
+    It runs once before to find what takes long: suns to compare with times, and images to measure.
+    The transaction uses that where the photographs are still the same. If another image must be
+    measured by then, it begins again.
+
+    Raises
+    ------
+    ConflictError
+        If a field that it changes was changed since ``version``. The message names who changed
+        what.
+    """
+    prepared = Prepared()
     with runtime.database.reading() as session:
-        twin = load_heliostat_context(session, heliostat)
-        row = store.get_measurement(session, twin.row, identifier)
-        target, changes = row.target, PhotographChanges(reason)
-    fresh = _measured(runtime, twin, row, changes.of(row), target)
-    with runtime.database.writing() as session:
-        lock_row(session, HeliostatRow, twin.row.id, f"heliostat {heliostat}")
-        row = store.get_measurement(session, twin.row, identifier, arrays=True)
-        return _log_correction(session, heliostat, row, fresh, changes, actor)
+        trial = Corrections(session, actor, prepared, is_trial=True)
+        write(trial)
+    prepared.add(runtime, trial.columns)
+
+    def attempt(session: Session) -> Done:
+        corrections = Corrections(session, actor, prepared, version)
+        # Nothing that is read depends on what is written. So all rows are written together.
+        with session.no_autoflush:
+            done = write(corrections)
+        corrections.finish()
+        return done
+
+    for _ in range(ROUNDS):
+        try:
+            return runtime.database.run_in_transaction(attempt)
+        except _UnmeasuredError as error:
+            prepared.add(runtime, error.lacking)
+    raise ConflictError("the photographs change again and again; try again later")
 
 
-def _log_correction(
-    session: Session,
-    heliostat: str,
-    row: MeasurementRow,
-    fresh: dict[str, object],
-    changes: PhotographChanges,
-    actor: str,
-) -> bool:
-    """Write changed columns with their history; return False if none changed."""
-    before = _state(row)
-    _write(row, fresh, changes.excluded)
-    session.flush()
-    session.refresh(row, ["target"])
-    after = _state(row)
-    apart = [name for name, value in after.items() if value != before[name]]
-    if not apart:
-        return False
-    if not set(apart) <= set(_WEATHER):  # only the next calibration uses the weather
-        row.corrected_at = now()
-        delete_drift(session, row)
-    old, new = ({name: state[name] for name in apart} for state in (before, after))
-    session.add(
-        CorrectionRow(
-            measurement_id=row.id, created_by=actor, reason=changes.reason, before=old, after=new
+@dataclass(frozen=True)
+class _Task:
+    """A stored image to measure, with all that its flux depends on."""
+
+    sha256: str
+    photograph: Photograph
+    plane: JsonObject
+    cameras: tuple[Camera, ...]
+    origin: tuple[float, float, float]
+
+    def measure(self, runtime: Runtime) -> JsonObject:
+        """The columns that depend on the image."""
+        data, plane = runtime.images.read(self.sha256), store.target_plane(TargetRow(**self.plane))
+        _, flux = measure_photograph(runtime, self.photograph, data, plane, self.cameras)
+        (contradiction,) = find_sun_contradictions([self.photograph], self.origin)
+        row = measurement_row(self.photograph, flux, 0, contradiction)
+        return {name: getattr(row, name) for name in (*_METADATA, *_WEATHER, *_MEASURED)}
+
+
+class _Remeasured(NamedTuple):
+    """What an image was measured for, and the columns."""
+
+    task: _Task
+    columns: JsonObject
+
+
+class Prepared:
+    """What corrections need that takes long.
+
+    ``suns`` are contradictions of suns and times, ``measured`` re-measured images by row id.
+    """
+
+    def __init__(self) -> None:
+        self.suns: dict[tuple[object, ...], SunContradiction | None] = {}
+        self.measured: dict[int, _Remeasured] = {}
+
+    def add(self, runtime: Runtime, lacking: "CorrectedColumns") -> None:
+        """Compute what was lacking."""
+        for number, task in lacking.tasks.items():
+            self.measured[number] = _Remeasured(task, task.measure(runtime))
+        found = find_sun_contradictions(lacking.compared, lacking.model.site.origin)
+        self.suns |= dict(zip(map(_sun_key, lacking.compared), found, strict=True))
+
+
+def _sun_key(photograph: Photograph) -> tuple[object, ...]:
+    """What the contradiction of a photograph's sun and time depends on."""
+    sun, weather = photograph.sun, photograph.weather
+    return sun.azimuth_deg, sun.elevation_deg, photograph.taken_at, weather.temperature_c
+
+
+class _UnmeasuredError(Exception):
+    """Images must be measured before corrections can be written."""
+
+    def __init__(self, lacking: "CorrectedColumns") -> None:
+        self.lacking = lacking
+
+
+class CorrectedColumns:
+    """The columns of corrected photographs, from what is ``prepared``.
+
+    It collects what is lacking: ``tasks``, images to measure by row id, and in a trial
+    ``compared``, photographs whose sun is compared with their time.
+    """
+
+    def __init__(self, session: Session, prepared: Prepared, is_trial: bool) -> None:
+        self.tasks, self.compared = dict[int, _Task](), list[Photograph]()
+        self.model = get_model(session)
+        self._session, self._prepared, self._is_trial = session, prepared, is_trial
+
+    def of(self, row: MeasurementRow, changes: PhotographChanges) -> dict[str, object] | None:
+        """The columns of a corrected image; None if it is not measured yet."""
+        photograph, target, cameras = changes.of(row), row.target, self.model.cameras
+        if changes.target_name is not None:
+            target = store.get_target(self._session, changes.target_name)
+        before = camera_at(cameras, row.target.name, row.taken_at)
+        is_alike = (
+            target is row.target and camera_at(cameras, target.name, photograph.taken_at) == before
         )
-    )
-    if row.image is not None:
-        store.use_image(session, row.image, row.accepted, False)
-    about = {"reason": changes.reason, "before": old, "after": new}
-    audit.record(
-        session, actor, "measurement.corrected", f"heliostat {heliostat} {row.identifier}", **about
-    )
-    return True
-
-
-def _state(row: MeasurementRow) -> dict[str, object]:
-    """Metadata of a photograph, and the hash of its flux images."""
-    flux = None if row.arrays is None else digest(row.arrays)[:12]
-    excluded = {"excluded": row.reason == EXCLUDED, "flux": flux}
-    return stored_metadata(row) | vars(Weather.of(row)) | excluded
-
-
-def _new_values(
-    runtime: Runtime,
-    twin: HeliostatContext,
-    row: MeasurementRow,
-    photograph: Photograph,
-    target: TargetRow,
-) -> dict[str, object]:
-    """The columns of a corrected photograph."""
-    cameras = twin.model.cameras
-    before = camera_at(cameras, row.target.name, row.taken_at)
-    is_alike = (
-        target.id == row.target_id
-        and camera_at(cameras, target.name, photograph.taken_at) == before
-    )
-    if is_alike or row.image is None:
+        if not is_alike and row.image is not None:
+            return self.remeasured(row, photograph, target)
         motors = photograph.motor_position or (None, None)
         return {
-            "target_id": target.id,
+            "target": target,
             "sun_azimuth_deg": photograph.sun.azimuth_deg,
             "sun_elevation_deg": photograph.sun.elevation_deg,
             "taken_at": photograph.taken_at,
             "motor_axis_1": motors[0],
             "motor_axis_2": motors[1],
-            **sun_columns(row, photograph, twin),
+            **sun_columns(row, photograph, self._contradiction(photograph)),
             **vars(photograph.weather),
         }
-    return _measured(runtime, twin, row, photograph, target)
 
-
-def _measured(
-    runtime: Runtime,
-    twin: HeliostatContext,
-    row: MeasurementRow,
-    photograph: Photograph,
-    target: TargetRow,
-) -> dict[str, object]:
-    """The columns of a photograph that is re-measured."""
-    if row.image is not None and row.image.pruned_at is not None:
-        raise GoneError(
-            f"measurement {row.identifier} must be measured again, and its image was deleted on "
-            f"{row.image.pruned_at:%Y-%m-%d}; exclude it instead"
+    def remeasured(
+        self, row: MeasurementRow, photograph: Photograph, target: TargetRow
+    ) -> dict[str, object] | None:
+        """The columns of an image that is re-measured; None if that is still to be done."""
+        image = row.image
+        if image is None:
+            raise NotFoundError(f"measurement {row.identifier} came without an image")
+        if image.pruned_at is not None:
+            raise GoneError(
+                f"measurement {row.identifier} must be measured again, and its image was deleted on"
+                f" {image.pruned_at:%Y-%m-%d}; exclude it instead"
+            )
+        camera = camera_at(self.model.cameras, target.name, photograph.taken_at)
+        task = _Task(
+            image.sha256,
+            photograph,
+            {name: getattr(target, name) for name in _PLANE},
+            () if camera is None else (camera,),
+            self.model.site.origin,
         )
-    _, measured = measure_stored(runtime, row, photograph, twin, store.target_plane(target))
-    (contradiction,) = find_sun_contradictions([photograph], twin.origin)
-    new_row = measurement_row(photograph, measured, target.id, contradiction)
-    new_row.warnings = [*(new_row.warnings or ()), *other_warnings(row, photograph)] or None
-    return {name: getattr(new_row, name) for name in (*_METADATA, *_WEATHER, *_MEASURED)}
+        known = self._prepared.measured.get(row.id)
+        if known is None or known.task != task:
+            self.tasks[row.id] = task
+            return None
+        warnings = [*(known.columns["warnings"] or ()), *other_warnings(row, photograph)]
+        return known.columns | {"target": target, "warnings": warnings or None}
+
+    def _contradiction(self, photograph: Photograph) -> SunContradiction | None:
+        """What contradicts a photograph's time; a trial leaves it for later."""
+        key = _sun_key(photograph)
+        if key in self._prepared.suns:
+            return self._prepared.suns[key]
+        if self._is_trial:
+            self.compared.append(photograph)
+            return None
+        return find_sun_contradictions([photograph], self.model.site.origin)[0]
 
 
-def _write(row: MeasurementRow, fresh: dict[str, object], excluded: bool | None) -> None:
+class Corrections:
+    """Corrections of photographs in one transaction, by ``actor``.
+
+    If ``version`` is given, no field may have changed since then. A trial writes nothing, and finds
+    what must be prepared.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        actor: str,
+        prepared: Prepared,
+        version: int | None = None,
+        is_trial: bool = False,
+    ) -> None:
+        self.session, self.actor, self._is_trial = session, actor, is_trial
+        self.columns = CorrectedColumns(session, prepared, is_trial)
+        self._conflicts, self._outdated = list[str](), list[MeasurementRow]()
+        newest = newest_correction(session)
+        self._since = None if version is None or version >= newest else version
+        self._heliostats: dict[str, HeliostatRow] = {}
+        self._named: set[tuple[str, str]] = set()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all can be written: images are measured, and no field changed meanwhile."""
+        return not (self._is_trial or self.columns.tasks or self._conflicts)
+
+    def lock(self, heliostats: Iterable[str]) -> None:
+        """Lock heliostats in the order of their ids, before their photographs are read."""
+        rows = store.get_heliostats(self.session, sorted(set(heliostats)))
+        self._heliostats |= rows
+        for row in [] if self._is_trial else sorted(rows.values(), key=lambda row: row.id):
+            lock_heliostat(self.session, row)
+
+    def find(self, given: GivenCorrection) -> MeasurementRow:
+        """The named image; its photograph must not have been named before."""
+        found = self._heliostats.get(given.heliostat)
+        heliostat = found or store.get_heliostat(self.session, given.heliostat)
+        row = store.get_measurement(self.session, heliostat, given.identifier)
+        photograph = (given.heliostat, row.external_id or row.identifier)
+        if photograph in self._named:
+            raise InvalidInputError(
+                f"measurement {given.identifier} of {given.heliostat} is named twice; name it once"
+            )
+        self._named.add(photograph)
+        return row
+
+    def apply(self, given: GivenCorrection) -> Corrected:
+        """Correct all images of a photograph; raises what `correct_photograph` raises."""
+        row = self.find(given)
+        images = images_of_photograph(self.session, row).values()
+        made = [self._write(given, one, self.columns.of(one, given.changes)) for one in images]
+        return Corrected(row, [entry for entry in made if entry is not None])
+
+    def remeasure(self, given: GivenCorrection) -> Corrected:
+        """Re-measure an image and correct it."""
+        row = self.find(given)
+        columns = self.columns.remeasured(row, given.changes.of(row), row.target)
+        entry = self._write(given, row, columns)
+        return Corrected(row, [] if entry is None else [entry])
+
+    def finish(self) -> None:
+        """End the transaction; it fails if a field changed, or an image is not measured yet."""
+        if self._conflicts:
+            more = f"; and {len(self._conflicts) - 5} more" if len(self._conflicts) > 5 else ""
+            raise ConflictError(f"{'; '.join(self._conflicts[:5])}{more}. {audit.READ_AGAIN}")
+        if self.columns.tasks:
+            raise _UnmeasuredError(self.columns)
+        delete_drift(self.session, self._outdated)
+
+    def _write(
+        self, given: GivenCorrection, row: MeasurementRow, columns: dict[str, object] | None
+    ) -> CorrectionRow | None:
+        """Write changed columns with their history; None if none changed, or one may not."""
+        if columns is None or self._is_trial:
+            return None
+        has_flux, reason = "arrays" in columns, given.changes.reason
+        before = _state(row, has_flux)
+        _assign(row, columns, given.changes.excluded)
+        after = _state(row, has_flux)
+        apart = [name for name, value in after.items() if value != before[name]]
+        if not apart:
+            return None
+        self._require_unchanged(given, row, apart)
+        if not set(apart) <= set(_WEATHER):  # only the next calibration uses the weather
+            row.corrected_at = now()
+            self._outdated.append(row)
+        old, new = ({name: state[name] for name in apart} for state in (before, after))
+        entry = CorrectionRow(
+            measurement_id=row.id, created_by=self.actor, reason=reason, before=old, after=new
+        )
+        self.session.add(entry)
+        if row.image is not None:
+            store.use_image(self.session, row.image, row.accepted, False)
+        subject = f"heliostat {given.heliostat} {row.identifier}"
+        about = {"reason": reason, "before": old, "after": new}
+        audit.record(self.session, self.actor, "measurement.corrected", subject, **about)
+        return entry
+
+    def _require_unchanged(
+        self, given: GivenCorrection, row: MeasurementRow, names: Collection[str]
+    ) -> None:
+        """Note the fields among ``names`` that changed since the version."""
+        if self._since is not None:
+            subject = f"heliostat {given.heliostat} {row.identifier}"
+            entries = list_corrections(self.session, row, self._since)
+            self._conflicts += audit.list_changes(subject, entries, names)
+
+
+def _state(row: MeasurementRow, with_flux: bool) -> dict[str, object]:
+    """Metadata of a photograph, and the hash of its flux images."""
+    flux = None if not with_flux or row.arrays is None else digest(row.arrays)[:12]
+    excluded = {"excluded": row.reason == EXCLUDED, "flux": flux}
+    return stored_metadata(row) | vars(Weather.of(row)) | excluded
+
+
+def _assign(row: MeasurementRow, columns: dict[str, object], excluded: bool | None) -> None:
     was_excluded = row.reason == EXCLUDED
-    for name, value in fresh.items():
+    for name, value in columns.items():
         setattr(row, name, value)
     if excluded if excluded is not None else was_excluded:
         row.accepted, row.reason = False, EXCLUDED

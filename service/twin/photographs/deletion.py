@@ -18,10 +18,11 @@ def delete_photograph(
     See `service.store.photographs.photograph_deletion.delete_photograph`. During a back-up the
     files stay until the job `prunings` removes them.
     """
-    with runtime.database.writing() as session:
-        deleted = photograph_deletion.delete_photograph(
+    deleted = runtime.database.run_in_transaction(
+        lambda session: photograph_deletion.delete_photograph(
             session, heliostat, identifier, reason, actor, only_this
         )
+    )
     with runtime.images.removing() as is_free:
         if is_free:
             with runtime.database.writing() as session:

@@ -4,6 +4,7 @@ One session reads all inputs. The computation runs outside any session. One tran
 rows of image and measurement, and the heliostat's drift.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from sqlalchemy.orm import Session
 from model.ephemeris import SunContradiction
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging import MeasuredFlux
-from model.imaging.light import camera_at
+from model.imaging.light import Camera, camera_at
 from model.imaging.quality import Quality, refused
 from model.plant import TargetPlane
 from model.times import format_time
@@ -93,7 +94,9 @@ def ingest(
         _restore_lost_file(runtime, data)
         PHOTOGRAPHS.labels("known").inc()
         return Added(known.measurement, False)
-    pixels, measured = measure_photograph(runtime, photograph, data, known.twin, known.plane)
+    pixels, measured = measure_photograph(
+        runtime, photograph, data, known.plane, known.twin.model.cameras
+    )
     height, width = pixels.shape[:2]
     del pixels  # up to 300 MB, and the next steps may wait for the model
     (contradiction,) = find_sun_contradictions([photograph], known.twin.origin)
@@ -237,10 +240,10 @@ def measure_photograph(
     runtime: Runtime,
     photograph: Photograph,
     data: bytes,
-    twin: HeliostatContext,
     plane: TargetPlane,
+    cameras: Sequence[Camera],
 ) -> MeasuredImage:
-    """Decode an image file and measure its flux on ``plane``.
+    """Decode an image file and measure its flux on ``plane``, as seen by the plant's ``cameras``.
 
     Errors of the file are as in `ingest`.
     """
@@ -254,7 +257,7 @@ def measure_photograph(
             f"image: {len(data)} bytes is more than the {limit} allowed; crop or compress it"
         )
     corners = None if photograph.corners is None else np.array(photograph.corners)
-    camera = camera_at(twin.model.cameras, plane.name, photograph.taken_at)
+    camera = camera_at(cameras, plane.name, photograph.taken_at)
     with runtime.decoded(data) as pixels, runtime.computing("measure") as operations:
         try:
             flux = operations.measure(
@@ -275,9 +278,8 @@ def measure_stored(
     """Measure a stored image, with the metadata of ``photograph``."""
     if row.image_sha256 is None:
         raise NotFoundError(f"measurement {row.identifier} came without an image")
-    return measure_photograph(
-        runtime, photograph, runtime.images.read(row.image_sha256), twin, plane
-    )
+    data = runtime.images.read(row.image_sha256)
+    return measure_photograph(runtime, photograph, data, plane, twin.model.cameras)
 
 
 def measurement_row(

@@ -1,10 +1,9 @@
 """Photographs that are sent again: fill missing fields, ignore different ones, report both."""
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.imaging.light import camera_at
@@ -16,7 +15,7 @@ from service.sources.photograph import Photograph
 from service.store import audit
 from service.store.keys import RESERVED
 from service.store.photographs.correction_log import list_corrections, note_change
-from service.store.rows import ROUNDS, lock_row
+from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import NO_IMAGE, CorrectionRow, HeliostatRow, MeasurementRow
 from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
 from service.twin.heliostats.metadata import (
@@ -28,7 +27,7 @@ from service.twin.heliostats.metadata import (
 from service.twin.photographs.corrections import remeasure
 from service.twin.photographs.ingest import ingest, store_position
 from service.twin.runtime.runtime import Runtime
-from service.twin.warnings import sun_columns
+from service.twin.warnings import find_sun_contradictions, sun_columns
 
 FILLED = "sent again with what was missing"
 
@@ -45,6 +44,13 @@ class ReceivedPhotograph:
     is_new: bool
     filled: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
+
+
+class _Filled(NamedTuple):
+    """A filled photograph, and whether it must be re-measured."""
+
+    received: ReceivedPhotograph
+    needs_measuring: bool
 
 
 def receive(
@@ -117,9 +123,8 @@ def _lock(
     session: Session, heliostat: HeliostatRow, stored: MeasurementRow
 ) -> MeasurementRow | None:
     """Lock a known photograph's row for filling; None if it was deleted meanwhile."""
-    lock_row(session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}")
-    query = select(MeasurementRow.id).where(MeasurementRow.id == stored.id).with_for_update()
-    return None if session.scalar(query) is None else session.get(MeasurementRow, stored.id)
+    lock_heliostat(session, heliostat)
+    return session.get(MeasurementRow, stored.id)
 
 
 _SPOTS = ("focal_spot_m", "helios_spot_m")
@@ -186,7 +191,8 @@ def _fill(
     """
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat)
-    with runtime.database.writing() as session:
+
+    def fill(session: Session) -> _Filled | None:
         row = _lock(session, twin.row, present)
         if row is None:
             return None
@@ -206,9 +212,12 @@ def _fill(
             session, twin.row, row, photograph.external_id
         ):
             filled.append("id")
+        received = ReceivedPhotograph(row, False, tuple(filled), tuple(ignored))
         if not filled:
-            return ReceivedPhotograph(row, False, (), tuple(ignored))
-        for name, value in sun_columns(row, photograph_from_row(row), twin).items():
+            return _Filled(received, False)
+        now_known = photograph_from_row(row)
+        (contradiction,) = find_sun_contradictions([now_known], twin.origin)
+        for name, value in sun_columns(row, now_known, contradiction).items():
             setattr(row, name, value)
         after = missing | ({"id": photograph.external_id} if "id" in filled else {})
         session.add(
@@ -223,10 +232,13 @@ def _fill(
         note_change(session, row.heliostat_id)
         subject = f"heliostat {heliostat} {row.identifier}"
         audit.record(session, actor, "measurement.filled", subject, fields=filled)
-        needs_measuring = _changes_flux(twin, before, photograph_from_row(row))
-    if needs_measuring:
-        row = _remeasured(runtime, heliostat, row, actor)
-    return ReceivedPhotograph(row, False, tuple(filled), tuple(ignored))
+        return _Filled(received, _changes_flux(twin, before, now_known))
+
+    done = runtime.database.run_in_transaction(fill)
+    if done is None or not done.needs_measuring:
+        return done and done.received
+    row = _remeasured(runtime, heliostat, done.received.row, actor)
+    return replace(done.received, row=row)
 
 
 def _changes_flux(twin: HeliostatContext, before: Photograph, after: Photograph) -> bool:

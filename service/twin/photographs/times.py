@@ -13,8 +13,8 @@ from model.errors import InvalidInputError
 from service.base.fields import Moment
 from service.base.validation_messages import format_validation_error
 from service.store.photographs.groups import PhotographFilter, list_groups
-from service.twin.photographs.batches import MOST_ENTRIES, GivenCorrection
-from service.twin.photographs.corrections import PhotographChanges
+from service.twin.photographs.batches import MOST_ENTRIES
+from service.twin.photographs.corrections import GivenCorrection, PhotographChanges
 
 _MOMENT = TypeAdapter(Moment)
 

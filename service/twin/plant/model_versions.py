@@ -172,24 +172,30 @@ def _effects(data: Any) -> tuple[Effect, ...]:
 
 
 def adopt(
-    session: Session, number: int, actor: str, force: bool = False, reason: str | None = None
+    session: Session,
+    number: int,
+    actor: str,
+    force: bool = False,
+    reason: str | None = None,
+    shown: int | None = None,
 ) -> ModelRow:
     """Adopt the effects of a study in a new current version.
 
     The new version has the effects that the study assumed and those that it found. This is the
     model that the study's held-out photographs evaluated, also if ``force`` replaces another
-    current version. If it is current already, nothing changes.
+    current version. If it is current already, nothing changes. ``shown`` is the version that was
+    current when the study was read; None requires nothing.
 
     Raises
     ------
     NotFoundError
         If there is no such study.
     ConflictError
-        If the study found no effect. Without ``force``, also if its verdict is not "effect", or if
-        it was made with another version than the current one. Without a ``reason``, if the study
-        leaves questions open (`open_questions`).
+        If the study found no effect, or another version than ``shown`` is current. Without
+        ``force``, also if its verdict is not "effect", or if it was made with another version than
+        the current one. Without a ``reason``, if the study leaves questions open
+        (`open_questions`).
     """
-    store.serialize_writers(session)
     study = store.get_study(session, number)
     found = _effects(study.report)
     current = current_number(session)
@@ -199,6 +205,13 @@ def adopt(
         raise ConflictError(
             f"study {number}: its verdict is '{study.verdict}'; force it to adopt what it found"
             " anyway"
+        )
+    if shown not in (None, current):
+        newest = find_current(session)
+        by = "" if newest is None else f", adopted by {newest.adopted_by}"
+        raise ConflictError(
+            f"version {current} of the model is current{by}, instead of {shown} when study {number}"
+            " was read; read it again before you adopt it"
         )
     if study.model != current and not force:
         raise ConflictError(
@@ -239,7 +252,6 @@ def withdraw(session: Session, study: int, actor: str, reason: str | None = None
     ConflictError
         If the study is not adopted, or a later version is current.
     """
-    store.serialize_writers(session)
     store.get_study(session, study)
     row, current = find_adopted(session, study), find_current(session)
     if row is None or current is None:

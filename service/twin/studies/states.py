@@ -20,7 +20,7 @@ class StudyState:
     """A study's findings, and the newest version adopted from it.
 
     ``state`` is "replaced" if a later version is current. ``warnings`` are the conflicts that
-    adoption by force ignores.
+    adoption by force ignores. ``current`` is the number of the current version.
     """
 
     findings: StudyFindings
@@ -28,6 +28,7 @@ class StudyState:
     state: AdoptionState
     questions: list[OpenQuestion]
     warnings: list[str]
+    current: int
 
     @property
     def adopted(self) -> int | None:
@@ -62,4 +63,4 @@ def _state(
             f" {current}, which is current"
         )
     questions = open_questions(findings.effects, findings.unexplained_share)
-    return StudyState(findings, version, state, questions, warnings)
+    return StudyState(findings, version, state, questions, warnings, current)

@@ -18,10 +18,10 @@ from service import store
 from service.base.choices import Method, require_images
 from service.store import audit
 from service.store.keys import RESERVED
-from service.store.rows import lock_row
+from service.store.rows import lock_heliostat
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
-from service.store.tables import DecisionRow, HeliostatRow, MeasurementRow, SurfaceRow
+from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     HeliostatContext,
     accepted_measurement,
@@ -224,9 +224,7 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> StoredSu
     another surface became active meanwhile.
     """
     heliostat, new = predicted.twin.row, predicted.new
-    lock_row(
-        session, HeliostatRow, heliostat.id, f"heliostat {heliostat.name}"
-    )  # no photograph can be deleted now
+    lock_heliostat(session, heliostat)
     if predicted.known is not None:
         return StoredSurface(
             store.get_surface(session, heliostat, predicted.known.version), is_new=False

@@ -192,7 +192,9 @@ def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Count
     plant, has_history = folder.plant, (folder.root / history.PLANT).exists()
     declared = None if has_history else folder.declared()
     changes = runtime.database.run_in_transaction(
-        lambda session: setup.set_plant(session, actor, plant, declared, facts=folder.facts)
+        lambda session: setup.set_plant(
+            session, _authorship(folder, actor), plant, declared, facts=folder.facts
+        )
     )
     counts = Counter([f"plants {changes.plant}"])
     counts.update(f"targets {change}" for change in changes.targets.values())
@@ -210,15 +212,23 @@ def _put_heliostat(
     actor: str,
 ) -> list[str]:
     """Store a heliostat and its measured surface, if any, in one transaction."""
-    with runtime.database.writing() as session:
-        row, change = setup.set_heliostat(session, actor, name, folder.properties[name])
+
+    def put(session: Session) -> list[str]:
+        by = _authorship(folder, actor)
+        row, change = setup.set_heliostat(session, by, name, folder.properties[name])
         outcomes = [f"heliostats {change}"]
         if measured is not None:
             _, is_new = store.add_surface(session, row, measured, once=True)
             outcomes.append(f"surfaces {store.Change.NEW if is_new else store.Change.UNCHANGED}")
             if is_new:
                 audit.record(session, actor, "surface.imported", f"heliostat {name}")
-    return outcomes
+        return outcomes
+
+    return runtime.database.run_in_transaction(put)
+
+
+def _authorship(folder: MeasurementFolder, actor: str) -> setup.Authorship:
+    return setup.Authorship(actor, f"import of {folder.root.name}"[:200])
 
 
 def _measured_surface(folder: MeasurementFolder, name: str) -> store.NewSurface | None:

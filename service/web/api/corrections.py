@@ -2,7 +2,7 @@
 
 from typing import Annotated, Self
 
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Depends, Query, Response
 from pydantic import BaseModel, Field, model_validator
 
 from service import store
@@ -22,7 +22,7 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
-from service.store.photographs.correction_log import list_corrections, made_from
+from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
 from service.store.tables import MeasurementRow
 from service.twin.photographs.corrections import PhotographChanges, correct_photograph
 from service.twin.photographs.deletion import delete_photograph
@@ -33,10 +33,12 @@ from service.web.auth.dependencies import (
     OPERATE,
     READ,
     IdentityDep,
+    IfMatch,
     MeasurementPath,
     NamePath,
     RuntimeDep,
     require_json,
+    set_tag,
 )
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page
@@ -123,9 +125,12 @@ def patch_measurement(
     runtime: RuntimeDep,
     identity: IdentityDep,
     correction: CorrectionIn,
+    version: IfMatch,
+    response: Response,
 ) -> CorrectedOut:
     """Correct a photograph, or exclude it. This holds for all its images; its history is kept.
 
+    Only the named fields are written, so that corrections of other fields at the same time stay.
     With another target, the photograph is measured again. Surfaces and forecasts that were made
     from it stay, and the response names them. With `predict_again`, a job predicts the
     heliostat's surface again. Another weather outdates no surface, because only calibrations use
@@ -134,14 +139,15 @@ def patch_measurement(
     changes = PhotographChanges(
         reason=correction.reason,
         target_name=correction.target,
-        sun=correction.sun,
+        **({} if correction.sun is None else correction.sun.model_dump()),
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,
         weather=correction.weather,
         excluded=correction.excluded,
     )
-    row = correct_photograph(runtime, name, measurement, changes, identity.name)
+    row, _ = correct_photograph(runtime, name, measurement, changes, identity.name, version)
     with runtime.database.reading() as session:
+        set_tag(response, newest_correction(session, row))
         made, measured = made_from(session, row), measurement_out(session, name, row)
     job = predict_again(runtime, name, identity.name) if correction.predict_again else None
     return CorrectedOut(

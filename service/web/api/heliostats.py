@@ -12,17 +12,20 @@ from service.base.fields import HeliostatOf, Model, Name, Search, from_row
 from service.sources.heliostat_document import HeliostatDocument
 from service.sources.heliostat_of_type import HeliostatOfType
 from service.sources.schema import HeliostatProperties
+from service.store import audit
 from service.store.rows import Put
 from service.store.tables import HeliostatRow
 from service.twin.plant import setup
+from service.twin.plant.setup import Authorship
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
-    IdentityDep,
+    AuthorshipDep,
     Limit,
     NamePath,
     RuntimeDep,
     require_json,
+    set_tag,
 )
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page, page
@@ -96,14 +99,14 @@ def heliostat_out(row: HeliostatRow) -> HeliostatOut:
 
 def _set(
     session: Session,
-    actor: str,
+    by: Authorship,
     name: str,
     given: HeliostatProperties | HeliostatOfType | HeliostatDocument,
     replace: bool = True,
 ) -> Put[HeliostatRow]:
     if isinstance(given, HeliostatOfType):
-        return setup.set_heliostat_of_type(session, actor, name, given, replace)
-    return setup.set_heliostat(session, actor, name, given.raw, replace)
+        return setup.set_heliostat_of_type(session, by, name, given, replace)
+    return setup.set_heliostat(session, by, name, given.raw, replace)
 
 
 router = APIRouter(tags=["heliostats"])
@@ -138,16 +141,14 @@ def list_heliostats(
     dependencies=[OPERATE, Depends(require_json)],
 )
 def post_heliostat(
-    request: HeliostatIn, runtime: RuntimeDep, identity: IdentityDep, response: Response
+    request: HeliostatIn, runtime: RuntimeDep, by: AuthorshipDep, response: Response
 ) -> HeliostatOut:
     """Add a heliostat.
 
     The same heliostat again is no error. The same name with other properties is refused; use PUT.
     """
     row, change = runtime.database.run_in_transaction(
-        lambda session: _set(
-            session, identity.name, request.name, request.properties, replace=False
-        )
+        lambda session: _set(session, by, request.name, request.properties, replace=False)
     )
     if change is store.Change.UNCHANGED:
         response.status_code = status.HTTP_200_OK
@@ -157,9 +158,10 @@ def post_heliostat(
 
 
 @router.get("/heliostats/{name}", responses=problems(404), dependencies=[READ])
-def get_heliostat(name: NamePath, runtime: RuntimeDep) -> HeliostatOut:
+def get_heliostat(name: NamePath, runtime: RuntimeDep, response: Response) -> HeliostatOut:
     """Get a heliostat with its properties."""
     with runtime.database.reading() as session:
+        set_tag(response, audit.version(session, f"heliostat {name}", "heliostat.set"))
         return heliostat_out(store.get_heliostat(session, name))
 
 
@@ -175,7 +177,7 @@ def put_heliostat(
     name: NamePath,
     properties: AnyHeliostat,
     runtime: RuntimeDep,
-    identity: IdentityDep,
+    by: AuthorshipDep,
     response: Response,
 ) -> HeliostatOut:
     """Set a heliostat of any type.
@@ -185,7 +187,7 @@ def put_heliostat(
     taken as well.
     """
     row, change = runtime.database.run_in_transaction(
-        lambda session: _set(session, identity.name, name, properties)
+        lambda session: _set(session, by, name, properties)
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
@@ -199,11 +201,11 @@ def put_heliostat(
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
-def delete_heliostat(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+def delete_heliostat(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> None:
     """Delete a heliostat that was created by mistake.
 
     This is refused if photographs, surfaces or anything else refers to it.
     """
     runtime.database.run_in_transaction(
-        lambda session: setup.remove(session, identity.name, "heliostat", name)
+        lambda session: setup.remove(session, by, "heliostat", name)
     )

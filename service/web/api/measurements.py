@@ -37,6 +37,7 @@ from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
 from service.sources.schema import WeatherFields, paint_motors
 from service.store.listing import Order, Period
+from service.store.photographs.correction_log import newest_correction
 from service.store.photographs.measurements import MeasurementFilter
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.heliostats.metadata import spot_m
@@ -52,6 +53,7 @@ from service.web.auth.dependencies import (
     NamePath,
     RuntimeDep,
     require_multipart,
+    set_tag,
 )
 from service.web.responses import formats
 from service.web.responses.files import WholeFile, etag_matches
@@ -458,11 +460,13 @@ def list_measurements(
 
 @router.get("/{measurement}", responses=problems(404), dependencies=[READ])
 def get_measurement(
-    name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep
+    name: NamePath, measurement: MeasurementPath, runtime: RuntimeDep, response: Response
 ) -> MeasurementOut:
-    """Get a photograph's measurement with its quality record."""
+    """Get a photograph's measurement with its quality record. Its ETag is for PATCH."""
     with runtime.database.reading() as session:
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+        set_tag(response, newest_correction(session, row))
+        session.refresh(row)
         return measurement_out(session, name, row)
 
 

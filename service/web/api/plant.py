@@ -23,6 +23,7 @@ from service.sources.documents import (
 )
 from service.sources.plant_schema import CameraEntry, Marks
 from service.sources.schema import TowerMeasurements
+from service.store import audit
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
@@ -31,10 +32,11 @@ from service.twin.plant.model_versions import get_model
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
-    IdentityDep,
+    AuthorshipDep,
     NamePath,
     RuntimeDep,
     require_json,
+    set_tag,
 )
 from service.web.responses.openapi import problems
 from service.web.responses.paging import Page
@@ -237,7 +239,6 @@ _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
 
 
 def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
-    store.serialize_writers(session)  # the origin must not change before the target is stored
     origin = store.get_plant(session).origin
     return TargetPlane.from_corners(
         name, *(wgs84_to_enu(getattr(corners, corner), origin) for corner in _CORNERS)
@@ -245,16 +246,18 @@ def _from_corners(session: Session, name: str, corners: Corners) -> TargetPlane:
 
 
 @router.get("/plant", responses=problems(409), dependencies=[READ])
-def get_plant(runtime: RuntimeDep) -> PlantOut:
+def get_plant(runtime: RuntimeDep, response: Response) -> PlantOut:
     """Get the plant: its name, tower base and declared model."""
     with runtime.database.reading() as session:
-        return plant_out(session)
+        plant = plant_out(session)
+        set_tag(response, audit.version(session, f"plant {plant.name}", "plant.set"))
+        return plant
 
 
 @router.put(
     "/plant", responses=problems(409, 413, 415), dependencies=[OPERATE, Depends(require_json)]
 )
-def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: IdentityDep) -> PlantOut:
+def put_plant(document: TowerMeasurements, runtime: RuntimeDep, by: AuthorshipDep) -> PlantOut:
     """Set the plant: tower base, targets and receivers.
 
     The body is PAINT's tower measurements. Repeating the request changes nothing. `receivers` are
@@ -277,7 +280,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, identity: Identi
 
     def write(session: Session) -> PlantOut:
         plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)
-        setup.set_plant(session, identity.name, plant, document.declared, corners, facts)
+        setup.set_plant(session, by, plant, document.declared, corners, facts)
         return plant_out(session)
 
     return runtime.database.run_in_transaction(write)
@@ -291,9 +294,10 @@ def list_targets(runtime: RuntimeDep) -> Page[TargetOut]:
 
 
 @router.get("/targets/{name}", responses=problems(404), dependencies=[READ])
-def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
+def get_target(name: NamePath, runtime: RuntimeDep, response: Response) -> TargetOut:
     """Get a target plane."""
     with runtime.database.reading() as session:
+        set_tag(response, audit.version(session, f"target {name}", "target.set"))
         return target_out(store.get_target(session, name))
 
 
@@ -303,11 +307,7 @@ def get_target(name: NamePath, runtime: RuntimeDep) -> TargetOut:
     dependencies=[OPERATE, Depends(require_json)],
 )
 def put_target(
-    name: NamePath,
-    request: TargetIn,
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-    response: Response,
+    name: NamePath, request: TargetIn, runtime: RuntimeDep, by: AuthorshipDep, response: Response
 ) -> TargetOut:
     """Set a target plane, by its rectangle [m] or its corners in WGS84.
 
@@ -319,10 +319,10 @@ def put_target(
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-            return setup.set_target(session, identity.name, request.located(plane), corners)
+            return setup.set_target(session, by, request.located(plane), corners)
         assert request.plane is not None  # the schema requires one of the two
         plane = request.plane.named(name)
-        return setup.set_target(session, identity.name, request.located(plane))
+        return setup.set_target(session, by, request.located(plane))
 
     row, change = runtime.database.run_in_transaction(write)
     if change is store.Change.NEW:
@@ -337,14 +337,12 @@ def put_target(
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
-def delete_target(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+def delete_target(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> None:
     """Delete a target plane that was created by mistake.
 
     This is refused if photographs, forecasts or waiting jobs refer to it.
     """
-    runtime.database.run_in_transaction(
-        lambda session: setup.remove(session, identity.name, "target", name)
-    )
+    runtime.database.run_in_transaction(lambda session: setup.remove(session, by, "target", name))
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
@@ -356,9 +354,10 @@ def list_receivers(runtime: RuntimeDep) -> ReceiverPage:
 
 
 @router.get("/receivers/{name}", responses=problems(404), dependencies=[READ])
-def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
+def get_receiver(name: NamePath, runtime: RuntimeDep, response: Response) -> ReceiverOut:
     """Get a receiver."""
     with runtime.database.reading() as session:
+        set_tag(response, audit.version(session, f"receiver {name}", "receiver.set"))
         return receiver_out(store.get_receiver(session, name))
 
 
@@ -368,18 +367,14 @@ def get_receiver(name: NamePath, runtime: RuntimeDep) -> ReceiverOut:
     dependencies=[OPERATE, Depends(require_json)],
 )
 def put_receiver(
-    name: NamePath,
-    request: ReceiverIn,
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-    response: Response,
+    name: NamePath, request: ReceiverIn, runtime: RuntimeDep, by: AuthorshipDep, response: Response
 ) -> ReceiverOut:
     """Set a receiver: a plane, a cylinder, panels side by side, or a cavity.
 
     `kind` says which. Without it, the receiver is a cylinder.
     """
     row, change = runtime.database.run_in_transaction(
-        lambda session: setup.set_receiver(session, identity.name, request.named(name))
+        lambda session: setup.set_receiver(session, by, request.named(name))
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
@@ -393,11 +388,9 @@ def put_receiver(
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
-def delete_receiver(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> None:
+def delete_receiver(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> None:
     """Delete a receiver that was created by mistake.
 
     This is refused if waiting jobs refer to it.
     """
-    runtime.database.run_in_transaction(
-        lambda session: setup.remove(session, identity.name, "receiver", name)
-    )
+    runtime.database.run_in_transaction(lambda session: setup.remove(session, by, "receiver", name))

@@ -6,6 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response, status
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import NotFoundError
@@ -201,12 +202,15 @@ def adopt_study(
 ) -> AdoptedOut:
     """Adopt the result of a study. It becomes the current version of the plant model."""
     asked = request or AdoptIn()
-    with runtime.database.writing() as session:
+
+    def adopt(session: Session) -> AdoptedOut:
         row = model_versions.adopt(session, number, identity.name, asked.force, asked.reason)
         outdated = {
             one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
         }
         return AdoptedOut(**dict(model_out(row, is_current=True)), outdated_surfaces=outdated)
+
+    return runtime.database.run_in_transaction(adopt)
 
 
 @router.post(
@@ -219,6 +223,9 @@ def withdraw_study(
 
     The version before it is current again, and is the response.
     """
-    with runtime.database.writing() as session:
+
+    def withdraw(session: Session) -> ModelOut:
         model_versions.withdraw(session, number, identity.name, (request or WithdrawIn()).reason)
         return current_out(session)
+
+    return runtime.database.run_in_transaction(withdraw)

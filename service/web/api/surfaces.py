@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
 from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.arrays import unpack
@@ -33,7 +34,6 @@ from service.base.fields import (
 from service.drawing.pictures import surface_picture
 from service.store.listing import Order, Period
 from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
@@ -46,10 +46,12 @@ from service.web.auth.dependencies import (
     OVERVIEW_SLOT,
     READ,
     IdentityDep,
+    IfMatch,
     Limit,
     NamePath,
     RuntimeDep,
     require_json,
+    set_tag,
 )
 from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
@@ -335,7 +337,9 @@ def _at(runtime: Runtime, name: str, moment: datetime | None, media_type: str) -
     with runtime.database.reading() as session:
         heliostat = store.get_heliostat(session, name)
         row = store.get_surface_at(session, heliostat, moment)
-    return surface_answer(runtime, heliostat, row, media_type)
+    response = surface_answer(runtime, heliostat, row, media_type)
+    set_tag(response, row.version)
+    return response
 
 
 @router.get(
@@ -359,29 +363,41 @@ def get_current_surface(
     "/current", responses=problems(404, 413, 415), dependencies=[OPERATE, Depends(require_json)]
 )
 def put_current_surface(
-    name: NamePath, runtime: RuntimeDep, identity: IdentityDep, choice: Annotated[ChoiceIn, Body()]
+    name: NamePath,
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    choice: Annotated[ChoiceIn, Body()],
+    active: IfMatch,
 ) -> DecisionOut:
-    """Make a version the active surface.
+    """Make a version the active surface. If-Match names the one that was active.
 
     Accuracies are not compared. Versions with precedence over it become candidates.
     """
-    with runtime.database.writing() as session:
-        heliostat = store.get_heliostat(session, name)
-        surface = store.get_surface(session, heliostat, choice.version)
-        return decision_out(
-            decisions.promote(
-                session, heliostat, surface, identity.name, Justification(choice.reason)
+    return runtime.database.run_in_transaction(
+        lambda session: decision_out(
+            decisions.decide(
+                session, name, choice.version, True, identity.name, choice.reason, active
             )
         )
+    )
 
 
 @router.post("/undo", responses=problems(404, 409), dependencies=[OPERATE])
-def undo_decision(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> DecisionOut:
-    """Undo the last decision about the active surface. The previous one is active again."""
-    with runtime.database.writing() as session:
+def undo_decision(
+    name: NamePath, runtime: RuntimeDep, identity: IdentityDep, active: IfMatch
+) -> DecisionOut:
+    """Undo the last decision about the active surface. The previous one is active again.
+
+    If-Match names the surface that was active, so that only one of two simultaneous undos succeeds.
+    """
+
+    def undo(session: Session) -> DecisionOut:
+        heliostat = store.get_heliostat(session, name)
         return decision_out(
-            decisions.undo_decision(session, store.get_heliostat(session, name), identity.name)
+            decisions.undo_decision(session, heliostat, identity.name, shown=active)
         )
+
+    return runtime.database.run_in_transaction(undo)
 
 
 @router.get("/decisions", responses=problems(404), dependencies=[READ])

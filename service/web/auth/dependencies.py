@@ -5,17 +5,20 @@ returns. A session from a dependency would keep its connection while the request
 and other threads would wait for that connection.
 """
 
+import re
 import threading
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Annotated, Any
 
-from fastapi import Depends, Path, Query, Request
+from fastapi import Depends, Header, Path, Query, Request, Response
 
+from model.errors import InvalidInputError
 from service.base.errors import UnsupportedContentError
-from service.base.fields import MeasurementName, Name
+from service.base.fields import MeasurementName, Name, Reason
 from service.jobs.kind import Kinds
 from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.plant.setup import Authorship
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.auth.fair_limiter import FairLimiter
@@ -130,6 +133,51 @@ COMPUTE_SLOT = Depends(_compute, scope="function")
 NamePath = Annotated[Name, Path(description="Name of the heliostat or target.")]
 MeasurementPath = Annotated[MeasurementName, Path()]
 Limit = Annotated[int, Query(ge=1, le=500, description="Most items on a page.")]
+
+
+async def _if_match(
+    if_match: Annotated[
+        str | None,
+        Header(
+            description=(
+                "The ETag of what was read: the answer is 409 if somebody changed the same fields"
+                " since, and names who, when and what."
+            )
+        ),
+    ] = None,
+) -> int | None:
+    if if_match is None or if_match.strip() == "*":
+        return None
+    found = _TAG.fullmatch(if_match.strip())
+    if found is None:
+        raise InvalidInputError("If-Match: send the ETag of the answer to GET as it came")
+    return int(found[1])
+
+
+IfMatch = Annotated[int | None, Depends(_if_match)]
+"""The version that If-Match names; None without one."""
+
+
+async def _authorship(
+    identity: IdentityDep,
+    version: IfMatch,
+    reason: Annotated[
+        Reason | None,
+        Query(description="Why; kept in the audit trail. Needed for a change of what is stored."),
+    ] = None,
+) -> Authorship:
+    return Authorship(identity.name, reason, version)
+
+
+AuthorshipDep = Annotated[Authorship, Depends(_authorship)]
+"""Who changes the plant, why, and since which version nobody else may have changed it."""
+
+_TAG = re.compile(r'"v([0-9]{1,10})"')
+
+
+def set_tag(response: Response, version: int) -> None:
+    """Set the ETag of a version, for `IfMatch`."""
+    response.headers["ETag"] = f'"v{version}"'
 
 
 def _content_type(request: Request) -> str:

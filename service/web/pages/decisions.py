@@ -1,17 +1,21 @@
 """Forms that exclude photographs, choose the active surface, undo that, acknowledge warnings."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Path, Response
 from pydantic import Field
+from sqlalchemy.orm import Session
 
 from service import store
-from service.base.errors import ConflictError
-from service.base.fields import MeasurementName, Model, Reason, Text, Version
+from service.base.fields import MeasurementName, Model, ReadVersion, Reason, Text, Version
 from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
 from service.twin.alarms.acknowledging import acknowledge_surface
-from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.corrections import (
+    GivenCorrection,
+    PhotographChanges,
+    correct_photographs,
+)
+from service.twin.runtime.runtime import Runtime
 from service.web.api.corrections import predict_again
 from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
@@ -28,9 +32,14 @@ router = APIRouter(include_in_schema=False)
 
 
 class TakeForm(Model):
-    """The button, with an optional reason."""
+    """The button, with an optional reason, and the version that was active; 0 for none."""
 
     reason: Annotated[Text, Field(max_length=200)] = ""
+    active: ReadVersion = None
+
+
+def _decide(runtime: Runtime, *about: Any) -> None:
+    runtime.database.run_in_transaction(lambda session: decisions.decide(session, *about))
 
 
 @router.post("/heliostats/{name}/surfaces/{version}/take", dependencies=[OPERATE])
@@ -42,11 +51,8 @@ def post_take_form(
     identity: IdentityDep,
 ) -> Response:
     """Make a version the active surface."""
-    with runtime.database.writing() as session:
-        heliostat = store.get_heliostat(session, name)
-        surface = store.get_surface(session, heliostat, version)
-        reason = form.reason or f"{identity.name} chose it"
-        decisions.promote(session, heliostat, surface, identity.name, Justification(reason))
+    reason = form.reason or f"{identity.name} chose it"
+    _decide(runtime, name, version, True, identity.name, reason, form.active)
     return go_to(f"/heliostats/{name}#history-title")
 
 
@@ -59,14 +65,15 @@ def post_keep_form(
     identity: IdentityDep,
 ) -> Response:
     """Keep the active surface instead of a candidate."""
-    with runtime.database.writing() as session:
-        heliostat = store.get_heliostat(session, name)
-        surface = store.get_surface(session, heliostat, version)
-        if not surface.is_candidate:
-            raise ConflictError(f"version {version} of {name} is no candidate; reload the page")
-        reason = form.reason or f"{identity.name} kept the active surface"
-        decisions.reject(session, heliostat, surface, identity.name, Justification(reason))
+    reason = form.reason or f"{identity.name} kept the active surface"
+    _decide(runtime, name, version, False, identity.name, reason, form.active)
     return go_to(f"/heliostats/{name}#history-title")
+
+
+class DecisionUndoForm(Model):
+    """The button that undoes a decision; without its number, the last one."""
+
+    decision: ReadVersion = None
 
 
 class ExclusionForm(Model):
@@ -76,6 +83,7 @@ class ExclusionForm(Model):
     reason: Reason
     excluded: bool = True
     predict_again: bool = False
+    version: ReadVersion = None
 
 
 @router.post("/heliostats/{name}/exclusions", dependencies=[OPERATE, COMPUTE_SLOT])
@@ -87,8 +95,8 @@ def post_exclusion_form(
 ) -> Response:
     """Exclude photographs or use them again, and go to the job that predicts the surface again."""
     changes = PhotographChanges(form.reason, excluded=form.excluded)
-    for photograph in form.photographs:
-        correct_photograph(runtime, name, photograph, changes, identity.name)
+    given = [GivenCorrection(name, photograph, changes) for photograph in form.photographs]
+    correct_photographs(runtime, given, identity.name, form.version)
     if form.predict_again:
         return go_to(f"/jobs/{predict_again(runtime, name, identity.name)}")
     return go_to(f"/heliostats/{name}#excluded-title")
@@ -110,8 +118,17 @@ def post_acknowledge_form(
 
 
 @router.post("/heliostats/{name}/surfaces/undo", dependencies=[OPERATE])
-def post_undo_form(name: NamePath, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+def post_undo_form(
+    name: NamePath,
+    form: Annotated[DecisionUndoForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
     """Undo the last decision."""
-    with runtime.database.writing() as session:
-        decisions.undo_decision(session, store.get_heliostat(session, name), identity.name)
+
+    def undo(session: Session) -> None:
+        heliostat = store.get_heliostat(session, name)
+        decisions.undo_decision(session, heliostat, identity.name, decision=form.decision)
+
+    runtime.database.run_in_transaction(undo)
     return go_to(f"/heliostats/{name}#history-title")

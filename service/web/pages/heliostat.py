@@ -28,6 +28,7 @@ from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Timeline
 from service.store import acknowledgements
 from service.store.acknowledgements import AcknowledgementBatch
+from service.store.photographs.correction_log import newest_correction
 from service.store.photographs.groups import (
     PhotographFilter,
     PhotographGroup,
@@ -294,8 +295,12 @@ def _mount_context(mount: MountRow) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class _HeliostatData:
-    """Data of the page, read before the slot for drawing is taken."""
+    """Data of the page, read before the slot for drawing is taken.
 
+    ``version`` is that of the photographs' corrections.
+    """
+
+    version: int
     row: HeliostatRow
     origin: tuple[float, float, float]
     today: SurfaceRow | None
@@ -332,6 +337,7 @@ def _read(
     It waits for comparisons that are computed in the background.
     """
     with runtime.database.reading() as session:
+        correction = newest_correction(session)
         row, origin = store.get_heliostat(session, name), store.get_plant(session).origin
         today = store.find_surface_at(session, row)
         surface = today if version is None else store.get_surface(session, row, version)
@@ -358,6 +364,7 @@ def _read(
         if facts is not None:
             likely, evidence = causes.rank_causes(facts), outlier_evidence(facts)
     return _HeliostatData(
+        correction,
         row,
         origin,
         today,
@@ -407,6 +414,7 @@ def get_heliostat_page(
     return render(
         request,
         "heliostat.html",
+        version=read.version,
         heliostat=read.row,
         size=read.row.size_m,
         surface=read.surface,

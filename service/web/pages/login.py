@@ -60,7 +60,7 @@ def post_login(
     next_: Annotated[Text, Form(alias="next")] = "/",
 ) -> Response:
     """Begin a session with a valid key and continue; otherwise show the form again."""
-    token = begin_session(runtime, key.strip())
+    token = begin_session(runtime, request, key.strip())
     if token is None:
         return _form(request, next_, _WRONG)
     answer = go_to(own_path(next_))

@@ -1,9 +1,10 @@
 """Page of a photograph: comparison with the forecast, correction form, and derived results."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from datetime import datetime
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Form, Header, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -12,13 +13,23 @@ from sqlalchemy import select
 from model.errors import ModelError
 from service import store
 from service.base.errors import NotFoundError, ServiceError
-from service.base.fields import AZIMUTH, ELEVATION, FormMoment, Model, Name, Reason, Sun
+from service.base.fields import (
+    AZIMUTH,
+    ELEVATION,
+    FormMoment,
+    JsonObject,
+    Model,
+    Name,
+    ReadVersion,
+    Reason,
+)
 from service.drawing.pictures import photograph_picture
 from service.drawing.templates import in_words
-from service.store.photographs.correction_log import list_corrections, made_from
+from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
 from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.heliostats.metadata import stored_metadata
 from service.twin.photographs.corrections import (
     NothingToChangeError,
     PhotographChanges,
@@ -53,7 +64,7 @@ DIGITS = 4
 
 
 class CorrectionForm(Model):
-    """The correction form, which is filled with the stored values."""
+    """The correction form, which is filled with the stored values of ``version``."""
 
     reason: Reason
     target: Name | None = None
@@ -62,24 +73,37 @@ class CorrectionForm(Model):
     taken_at: FormMoment | None = None
     excluded: bool = False
     predict_again: bool = False
+    version: ReadVersion = None
 
-    def without_rounding(self, row: MeasurementRow) -> Self:
-        """The form with the stored values where it has them as the page rounds them."""
-        taken_at = row.taken_at
-        shown = {
-            "azimuth_deg": (round(row.sun_azimuth_deg, DIGITS), row.sun_azimuth_deg),
-            "elevation_deg": (round(row.sun_elevation_deg, DIGITS), row.sun_elevation_deg),
-            "taken_at": (taken_at and taken_at.replace(microsecond=0), taken_at),
+    def changes(self, row: MeasurementRow, since: Sequence[CorrectionRow]) -> PhotographChanges:
+        """What its user changed of a stored photograph, which was corrected ``since`` it was shown.
+
+        The page rounds angles and times.
+        """
+        shown: JsonObject = stored_metadata(row) | {"excluded": row.reason == EXCLUDED}
+        for correction in reversed(since):
+            shown |= correction.before
+        before = shown["taken_at"] and datetime.fromisoformat(shown["taken_at"])
+        rounded = {
+            "target": shown["target"],
+            "azimuth_deg": round(shown["sun.azimuth_deg"], DIGITS),
+            "elevation_deg": round(shown["sun.elevation_deg"], DIGITS),
+            "taken_at": before and before.replace(microsecond=0),
+            "excluded": shown["excluded"],
         }
-        same = {name: full for name, (short, full) in shown.items() if getattr(self, name) == short}
-        return self.model_copy(update=same)
-
-    @property
-    def sun(self) -> Sun | None:
-        """The sun, if both angles are given."""
-        if self.azimuth_deg is None or self.elevation_deg is None:
-            return None
-        return Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg)
+        given = {
+            name: value
+            for name, was in rounded.items()
+            if (value := getattr(self, name)) not in (None, was)
+        }
+        return PhotographChanges(
+            reason=self.reason,
+            target_name=given.get("target"),
+            azimuth_deg=given.get("azimuth_deg"),
+            elevation_deg=given.get("elevation_deg"),
+            taken_at=given.get("taken_at"),
+            excluded=given.get("excluded"),
+        )
 
 
 def change_texts(correction: CorrectionRow) -> list[str]:
@@ -92,7 +116,7 @@ def change_texts(correction: CorrectionRow) -> list[str]:
             said.append("its flux was measured again")
         else:
             before, after = (
-                "not change_texts" if known is None else in_words(known)
+                "not known" if known is None else in_words(known)
                 for known in (correction.before[field], value)
             )
             name = field.removesuffix("_deg").replace(".", " ").replace("_", " ")
@@ -180,6 +204,7 @@ def get_photograph_page(
 ) -> HTMLResponse:
     """A photograph with its flux, the forecast of the current twin, and its history."""
     with runtime.database.reading() as session:
+        version = newest_correction(session)
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
         images = images_of_photograph(session, row)
         corrections, made = list_corrections(session, row), made_from(session, row)
@@ -194,6 +219,7 @@ def get_photograph_page(
         request,
         "photograph.html",
         name=name,
+        version=version,
         row=row,
         images=images,
         kept={kind: image for kind, image in images.items() if image.has_file},
@@ -222,16 +248,11 @@ def post_correction_form(
     with runtime.database.reading() as session:
         form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-        form = form.without_rounding(row)
-    changes = PhotographChanges(
-        reason=form.reason,
-        target_name=form.target,
-        sun=form.sun,
-        taken_at=form.taken_at,
-        excluded=form.excluded,
-    )
+        since = [] if form.version is None else list_corrections(session, row, form.version)
+        session.refresh(row)
+        changes = form.changes(row, since)
     try:
-        correct_photograph(runtime, name, measurement, changes, identity.name)
+        correct_photograph(runtime, name, measurement, changes, identity.name, form.version)
     except NothingToChangeError:
         return go_to(f"/heliostats/{name}/photographs/{measurement}?unchanged=true")
     if form.predict_again:

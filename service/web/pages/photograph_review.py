@@ -1,5 +1,6 @@
 """Queue of photographs to review: accept, exclude or skip each, and undo."""
 
+from contextlib import suppress
 from typing import Annotated, Literal
 from urllib.parse import urlencode
 
@@ -8,14 +9,17 @@ from fastapi.responses import HTMLResponse
 
 from model.errors import InvalidInputError, ModelError
 from service.base.errors import NotFoundError, ServiceError
-from service.base.fields import Reason, Version
+from service.base.fields import ReadVersion, Reason, Version
 from service.store import audit
-from service.store.photographs.correction_log import list_corrections
+from service.store.photographs.correction_log import newest_correction
 from service.store.photographs.groups import count_groups, get_group, list_groups
-from service.store.photographs.measurements import EXCLUDED
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.corrections import (
+    NothingToChangeError,
+    PhotographChanges,
+    correct_photograph,
+)
 from service.twin.photographs.display import compare_one
 from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.pages.heliostat import comparison_figures
@@ -61,6 +65,7 @@ class ReviewForm(ReviewQuery):
     next: Version | None = None
     action: Literal["accept", "exclude"]
     reason: Reason = "reviewed"
+    version: ReadVersion = None
 
 
 class UndoForm(ReviewQuery):
@@ -75,6 +80,7 @@ def get_review_page(
 ) -> HTMLResponse:
     """A photograph with its verdict and forecast, its place in the queue, and the buttons."""
     with runtime.database.reading() as session:
+        version = newest_correction(session)
         chosen = query.filter(session, plant_time_zone(session, runtime.settings.time_zone))
         listed = list_groups(session, chosen, 1, query.before) if query.at is None else []
         group = get_group(session, query.at) if query.at else next(iter(listed), None)
@@ -93,6 +99,7 @@ def get_review_page(
         request,
         "photograph_review.html",
         query=query,
+        version=version,
         group=group,
         images={image.kind: image for image in group.images if image.has_file} if group else {},
         following=following,
@@ -111,21 +118,21 @@ def post_review_form(
     """Accept or exclude a photograph, and go to the next one."""
     with runtime.database.reading() as session:
         group = get_group(session, form.at)
-    is_excluded, undo = group.verdict == "excluded", None
+    undo = None
     if form.action == "accept" and group.verdict == "refused":
         raise InvalidInputError(
             f"action: {group.name} was refused by its measurement; correct it on its page instead"
         )
-    if is_excluded != (form.action == "exclude"):
-        changes = PhotographChanges(form.reason, excluded=not is_excluded)
-        name, identifier = group.heliostat, group.best.identifier
-        row = correct_photograph(runtime, name, identifier, changes, identity.name)
-        with runtime.database.reading() as session:
-            undo = list_corrections(session, row)[-1].id
-    else:
-        with runtime.database.writing() as session:
-            subject = f"heliostat {group.heliostat} {group.best.identifier}"
-            audit.record(session, identity.name, "measurement.reviewed", subject)
+    changes = PhotographChanges(form.reason, excluded=form.action == "exclude")
+    name, identifier, actor = group.heliostat, group.best.identifier, identity.name
+    try:
+        corrected = correct_photograph(runtime, name, identifier, changes, actor, form.version)
+        undo = max(entry.id for entry in corrected.history)
+    except NothingToChangeError:
+        subject = f"heliostat {name} {identifier}"
+        runtime.database.run_in_transaction(
+            lambda session: audit.record(session, actor, "measurement.reviewed", subject)
+        )
     if form.next is None:
         return go_to(form.review(before=form.at, undo=undo))
     return go_to(form.review(at=form.next, undo=undo))
@@ -142,8 +149,7 @@ def post_undo_form(
             raise NotFoundError(f"undo: there is no exclusion {form.undo}")
         row = session.get_one(MeasurementRow, correction.measurement_id)
         name = session.get_one(HeliostatRow, row.heliostat_id).name
-        before = bool(correction.before["excluded"])
-    if (row.reason == EXCLUDED) != before:
-        changes = PhotographChanges("review undone", excluded=before)
-        correct_photograph(runtime, name, row.identifier, changes, identity.name)
+    changes = PhotographChanges("review undone", excluded=bool(correction.before["excluded"]))
+    with suppress(NothingToChangeError):
+        correct_photograph(runtime, name, row.identifier, changes, identity.name, form.undo)
     return go_to(form.review(at=row.id))

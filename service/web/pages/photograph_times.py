@@ -12,19 +12,20 @@ from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from model.times import format_time
-from service.base.fields import Lines, Model, Reason, Version
+from service.base.fields import Lines, Model, ReadVersion, Reason, Version
+from service.store.photographs.correction_log import newest_correction
 from service.store.tables import HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.batches import (
     MOST_ENTRIES,
     MOTORS,
     TIMES,
-    GivenCorrection,
     correct_many,
     list_batches,
     preview_many,
     undo_batch,
 )
+from service.twin.photographs.corrections import GivenCorrection
 from service.twin.photographs.times import read_motors, read_times, shifted_times
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
@@ -55,11 +56,12 @@ class ShiftForm(PhotographsQuery):
 
 
 class TimesForm(Model):
-    """The form that stores what the preview showed, as CSV lines."""
+    """The form that stores what the preview of a ``version`` showed, as CSV lines."""
 
     lines: Lines
     reason: Reason
     what: What = "times"
+    version: ReadVersion = None
 
 
 def _counts(session: Session) -> list[tuple[str, int]]:
@@ -95,7 +97,9 @@ def _preview(
 ) -> HTMLResponse:
     if len(given) > MOST_ENTRIES:
         raise InvalidInputError(f"lines: {len(given)} entries; give at most {MOST_ENTRIES} at once")
-    changes = preview_many(runtime, what, given)
+    with runtime.database.reading() as session:
+        version = newest_correction(session)
+        changes = preview_many(session, what, given)
     lines = io.StringIO()
     csv.writer(lines).writerows(
         (one.given.heliostat, one.given.identifier, *_values(one.given)) for one in changes
@@ -106,6 +110,7 @@ def _preview(
         changes=changes,
         unchanged=len(given) - len(changes),
         lines=lines.getvalue(),
+        version=version,
         what=what,
         reason=reason,
     )
@@ -163,7 +168,7 @@ def post_times_form(
     """Store what the preview showed, and return to the page, which can undo them."""
     given = _read(form.lines, "lines", form.what, form.reason, None)
     action = MOTORS if form.what == "motors" else TIMES
-    correct_many(runtime, given, form.reason, identity.name, action)
+    correct_many(runtime, given, form.reason, identity.name, action, form.version)
     return go_to("/photographs/times#recent-title")
 
 

@@ -5,10 +5,11 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import Field
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import ConflictError
-from service.base.fields import CheckedStudyReport, Method, Model, Text, Version
+from service.base.fields import CheckedStudyReport, Method, Model, ReadVersion, Text, Version
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
@@ -47,12 +48,13 @@ _CRUMB = "heliotwin study</p>"
 class DecisionForm(Model):
     """A form that adopts or withdraws. ``read`` is the tick below warnings.
 
-    ``back`` is the page to return to.
+    ``back`` is the page to return to, and ``current`` the version of the model that it showed.
     """
 
     read: bool = False
     reason: Annotated[Text, Field(max_length=200)] = ""
     back: Literal["", "list"] = ""
+    current: ReadVersion = None
 
     def path(self, number: int) -> str:
         """The path of the page to return to."""
@@ -183,11 +185,15 @@ def post_adopt_form(
     identity: IdentityDep,
 ) -> Response:
     """Adopt the result of a study as the next plant model."""
-    with runtime.database.writing() as session:
+
+    def adopt(session: Session) -> None:
         state = study_states(session, [store.get_study(session, number)])[number]
         if state.questions and form.reason and not form.read:
             raise ConflictError("read: tick 'I have read this' below the warning")
-        model_versions.adopt(session, number, identity.name, form.read, form.reason or None)
+        reason = form.reason or None
+        model_versions.adopt(session, number, identity.name, form.read, reason, form.current)
+
+    runtime.database.run_in_transaction(adopt)
     return go_to(form.path(number))
 
 
@@ -199,6 +205,7 @@ def post_withdraw_form(
     identity: IdentityDep,
 ) -> Response:
     """Withdraw the adopted model."""
-    with runtime.database.writing() as session:
-        model_versions.withdraw(session, number, identity.name, form.reason or None)
+    runtime.database.run_in_transaction(
+        lambda session: model_versions.withdraw(session, number, identity.name, form.reason or None)
+    )
     return go_to(form.path(number))

@@ -3,13 +3,14 @@
 Scripts cannot read the cookie, and pages of other sites cannot use it.
 """
 
+from datetime import timedelta
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Form, HTTPException, Request, Response, status
 
 from service.base.fields import Text
-from service.store import keys, sessions
+from service.store import audit, keys, sessions
 from service.twin.runtime.runtime import Runtime
 from service.web.auth import security
 from service.web.auth.dependencies import RuntimeDep
@@ -18,14 +19,27 @@ from service.web.responses.openapi import problems
 router = APIRouter(tags=["session"])
 
 
-def begin_session(runtime: Runtime, key: str) -> str | None:
-    """Begin a session with a key; None if the key is not valid."""
+_HOUR = timedelta(hours=1)
+# Refused logins of one address that the audit trail has of an hour, so that nobody can fill it.
+_MAX_REFUSED = 20
+
+
+def begin_session(runtime: Runtime, request: Request, key: str) -> str | None:
+    """Begin a session with a key, and audit it; None if the key is not valid."""
+    address = request.client.host if request.client else ""
     with runtime.database.reading() as session:
-        if keys.find(session, key) is None:
-            return None  # a wrong key must not wait for the write lock
+        is_known = keys.find(session, key) is not None
+        refused = audit.count_recent(session, f"address {address}", _HOUR)
+    if not is_known and refused >= _MAX_REFUSED:
+        return None  # floods of wrong keys do not wait for the write lock
     with runtime.database.writing() as session:
         row = keys.find(session, key)
-        return None if row is None else sessions.begin(session, row)
+        if row is None:
+            about = {"prefix": keys.prefix_of(key)}
+            audit.record(session, keys.NOBODY, "session.refused", f"address {address}", **about)
+            return None
+        audit.record(session, row.name, "session.begun", f"key {row.name}", address=address)
+        return sessions.begin(session, row)
 
 
 def keep_session(response: Response, request: Request, token: str) -> None:
@@ -64,7 +78,7 @@ def post_session(
     response: Response,
 ) -> None:
     """Begin a session in a cookie. It lasts half a day, or until the key is withdrawn."""
-    token = begin_session(runtime, key)
+    token = begin_session(runtime, request, key)
     if token is None:
         raise HTTPException(
             HTTPStatus.UNAUTHORIZED, "this key is not valid", {"WWW-Authenticate": "Bearer"}

@@ -74,7 +74,7 @@ def give(runtime: Runtime, *seeds: int) -> None:
 def give_to_another(runtime: Runtime, heliostat: str, data: bytes) -> tuple[MeasurementRow, bool]:
     """The same image, which this heliostat has, too."""
     with runtime.database.writing() as session:
-        setup.set_heliostat(session, "tester", heliostat, properties_document())
+        setup.set_heliostat(session, setup.Authorship("tester"), heliostat, properties_document())
     return ingest(
         runtime,
         heliostat,
@@ -325,7 +325,7 @@ def test_image_of_two_photographs_is_accepted_where_one_is(runtime: Runtime):
         row = session.scalars(
             select(MeasurementRow).where(MeasurementRow.image_sha256 == digest(picture(50)))
         ).one()
-        setup.set_heliostat(session, "tester", "AB38", properties_document())
+        setup.set_heliostat(session, setup.Authorship("tester"), "AB38", properties_document())
         heliostat, target = store.get_heliostat(session, "AB38"), store.get_target(session, "lower")
         image = session.get_one(ImageRow, row.image_sha256)
         again = MeasurementRow(

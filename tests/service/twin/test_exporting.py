@@ -109,7 +109,10 @@ def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
         "sun": {"shape": "pillbox", "half_angle_mrad": 4.65},
         "cameras": [{"transfer": {"gamma": 2.0}}],
     }
-    assert client.put("/v1/plant", json=tower | {"declared": declared}).status_code == 200
+    assert (
+        client.put("/v1/plant?reason=surveyed", json=tower | {"declared": declared}).status_code
+        == 200
+    )
     assert (
         client.post("/v1/heliostats/AA39/surfaces", json={"measurements": ["1"]}).status_code == 201
     )

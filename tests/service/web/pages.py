@@ -138,3 +138,22 @@ def work(app: FastAPI) -> None:
     worker = Worker(app.state.runtime, KINDS, "tester", threading.Event())
     while worker.work():
         pass
+
+
+def press(client: TestClient, page: Page, label: str, **changes: str) -> Any:
+    """Submit the form of the first button that begins with ``label``, as shown with changes."""
+    button = next(one for one in page.all("button") if one.words.startswith(label))
+    element: Any = button
+    while element.tag != "form":
+        element = element.parent
+    data = {
+        one["name"]: one.attributes.get("value", "true")
+        for one in element.all("input", name=True)
+        if one.attributes.get("type") not in ("checkbox", "file") or "checked" in one.attributes
+    }
+    for one in element.all("select", name=True):
+        chosen = [option for option in one.all("option") if "selected" in option.attributes]
+        data[one["name"]] = (chosen or one.all("option"))[0].words
+    if "name" in button.attributes:
+        data[button["name"]] = button["value"]
+    return client.post(element["action"], data=data | changes, headers=HTML)

@@ -380,7 +380,7 @@ def test_a_change_since_todays_plan_raises_an_alarm_until_a_new_plan(plant: Test
     properties = plant.get(path).json()["properties"]
     properties["position_m"][2] += 0.01
     with real.runtime_of(plant).database.writing() as session:
-        setup.set_heliostat(session, "tester", name, properties)
+        setup.set_heliostat(session, setup.Authorship("tester", "surveyed"), name, properties)
     (alarm,) = outdated(plant)
     assert f"plan {job['id']} of aims for today on main" in alarm["message"]
     assert f"properties of 1: {name}" in alarm["message"]
@@ -420,7 +420,7 @@ def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pyt
     properties = plant.get(f"/v1/heliostats/{name}").json()["properties"]
     properties["position_m"][2] += 0.01
     with real.runtime_of(plant).database.writing() as session:
-        setup.set_heliostat(session, "tester", name, properties)
+        setup.set_heliostat(session, setup.Authorship("tester", "surveyed"), name, properties)
     planned(plant, limit_w_m2=70e3, **body)
     assert len(traces) == 2
 

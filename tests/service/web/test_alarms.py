@@ -126,7 +126,7 @@ def test_new_heliostat_has_a_month_too_and_can_be_deleted_when_seen(
     (item,) = items(client)
     assert item["message"] == "none was ever accepted"
     acknowledge(client, item)
-    assert client.delete("/v1/heliostats/AA39").status_code == 204
+    assert client.delete("/v1/heliostats/AA39?reason=mistake").status_code == 204
     assert items(client) == []
 
 
@@ -342,7 +342,10 @@ def test_clock_that_went_wrong_until_it_is_calibrated_without(calibrating: TestC
 def test_camera_that_was_declared_again(client: TestClient):
     declared = {"cameras": [{"transfer": {"gamma": 2.0}, "since": "2024-03-01T00:00:00Z"}]}
     assert (
-        client.put("/v1/plant", json={**tower_document(), "declared": declared}).status_code == 200
+        client.put(
+            "/v1/plant?reason=surveyed", json={**tower_document(), "declared": declared}
+        ).status_code
+        == 200
     )
     (item,) = items(client)
     assert item["message"].startswith("version 2 of the model declared another camera")

@@ -65,7 +65,8 @@ def test_plants_in_opposite_orders_do_not_wait_for_each_other(
 
     def put(order: list[str], turn: int) -> int:
         targets = dict.fromkeys(order, tower[("lower", "upper")[turn % 2]])
-        return both.put("/v1/plant", json=head | targets).status_code
+        asked = {"reason": "surveyed"}
+        return both.put("/v1/plant", json=head | targets, params=asked).status_code
 
     assert put(names, 0) == 200
     for turn in range(1, 4):
@@ -150,10 +151,11 @@ def test_what_nothing_refers_to_is_deleted(
     both.put("/v1/targets/screen", json=PLANE)
     both.put("/v1/receivers/drum", json=CYLINDER)
     both.put("/v1/heliostats/AA39", json=properties)
+    why = {"reason": "a mistake"}
     for path in ("targets/screen", "receivers/drum", "heliostats/AA39"):
-        assert both.delete(f"/v1/{path}").status_code == 204
+        assert both.delete(f"/v1/{path}", params=why).status_code == 204
         assert both.get(f"/v1/{path}").status_code == 404
-        assert both.delete(f"/v1/{path}").status_code == 404
+        assert both.delete(f"/v1/{path}", params=why).status_code == 404
     # The name is free again, for either.
     assert both.put("/v1/receivers/screen", json=CYLINDER).status_code == 201
     with cast(FastAPI, both.app).state.runtime.database.reading() as session:
@@ -188,7 +190,7 @@ def test_what_is_referred_to_stays_and_says_by_what(
         ("receivers/drum", "jobs (1)"),
         ("heliostats/AA39", "measurements (1), forecasts (1)"),
     ):
-        answer = both.delete(f"/v1/{path}")
+        answer = both.delete(f"/v1/{path}?reason=mistake")
         assert (answer.status_code, by in answer.json()["detail"]) == (409, True), answer.text
         assert both.get(f"/v1/{path}").status_code == 200
 

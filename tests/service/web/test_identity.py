@@ -365,7 +365,10 @@ def test_a_position_is_filled_whatever_camera_its_time_names(client: TestClient)
     """There is no image to measure again."""
     declared = {"cameras": [{"transfer": {"gamma": 2.0}, "since": "2024-06-01T00:00:00Z"}]}
     assert (
-        client.put("/v1/plant", json=tower_document() | {"declared": declared}).status_code == 200
+        client.put(
+            "/v1/plant?reason=surveyed", json=tower_document() | {"declared": declared}
+        ).status_code
+        == 200
     )
     assert send_position(client, id="1").status_code == 201
     answer = send_position(client, id="1", taken_at="2024-05-01T10:00:00Z")

@@ -205,7 +205,7 @@ def test_all_forecasts_use_the_calibrated_mount(
     )
     for name, mount in mounts().items():
         np.testing.assert_allclose(mount.first_axis, east[:, 0], atol=1e-9, err_msg=name)
-    client.put("/v1/heliostats/AA39", json=properties | {"height": 2.5})
+    client.put("/v1/heliostats/AA39?reason=surveyed", json=properties | {"height": 2.5})
     assert not any(mount.is_calibrated for mount in mounts().values())
 
 
@@ -241,7 +241,9 @@ def test_mounts_hold_under_the_sun_they_were_calibrated_under(
         post(png(number), **taken)
     calibrate(client)
     assert client.get("/v1/heliostats/AA39/mounts/current").json()["sun"] == []
-    assert client.put("/v1/plant", json={**tower, "declared": slow}).status_code == 200
+    assert (
+        client.put("/v1/plant?reason=surveyed", json={**tower, "declared": slow}).status_code == 200
+    )
     refused = client.post("/v1/heliostats/AA39/motors", json={"sun": SUN, "target": "lower"})
     assert refused.status_code == 409
     assert "moves the sun otherwise" in refused.json()["detail"]
@@ -259,7 +261,9 @@ def test_a_tilt_acts_on_a_mount_that_was_never_calibrated(
     """Motors for an aim, and the light of those motors, by one mount."""
     heliostat = read_heliostat("AA39", properties, np.array(ORIGIN))
     tilt = {"effects": [{"name": "axis_tilt", "parameters": {"north_deg": 1.0, "up_deg": -2.0}}]}
-    assert client.put("/v1/plant", json={**tower, "declared": tilt}).status_code == 200
+    assert (
+        client.put("/v1/plant?reason=surveyed", json={**tower, "declared": tilt}).status_code == 200
+    )
     np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
 
 
@@ -345,7 +349,7 @@ def test_the_plan_asks_for_what_is_known_least(
 def test_the_plans_page_says_what_it_takes(client: TestClient, tower: Any, properties: Any):
     client.put("/v1/plant", json=tower)
     properties["kinematics_properties"]["actuators"] = [{"type_axis": "ideal"}] * 2
-    client.put("/v1/heliostats/AA39", json=properties)
+    client.put("/v1/heliostats/AA39?reason=surveyed", json=properties)
     page = client.get(
         "/calibration-plan", params={"at": NOON}, headers={"Accept": "text/html"}
     ).text
@@ -360,8 +364,8 @@ def test_changed_properties_ask_for_another_calibration(
         post(png(number), **taken)
     calibrate(client)
     properties["kinematics_properties"]["actuators"][0]["initial_angle"] += 0.01
-    client.put("/v1/heliostats/AA39", json=properties)
+    client.put("/v1/heliostats/AA39?reason=surveyed", json=properties)
     answer = client.post("/v1/heliostats/AA39/motors", json={"sun": SUN, "target": "lower"})
     assert answer.status_code == 409
     assert "changed since it was calibrated" in answer.text
-    assert client.delete("/v1/heliostats/AA39").status_code == 409
+    assert client.delete("/v1/heliostats/AA39?reason=mistake").status_code == 409

@@ -42,7 +42,7 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
 def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower: dict[str, Any]):
     """And stated by both numbers, over REST and on its page."""
     sun = {"shape": "buie", "csr": 0.05}
-    answer = client.put("/v1/plant", json=tower | {"declared": {"sun": sun}})
+    answer = client.put("/v1/plant?reason=surveyed", json=tower | {"declared": {"sun": sun}})
     assert answer.status_code == 200, answer.text
     found = answer.json()["sun_shape"]
     assert (found["shape"], found["csr"]) == ("buie", pytest.approx(0.05, abs=1e-4))
@@ -50,9 +50,12 @@ def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower
     words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
     assert "circumsolar share 5.0" in words
     wrong = {"declared": {"sun": sun | {"chi": 0.02}}}
-    assert client.put("/v1/plant", json=tower | wrong).status_code == 422
+    assert client.put("/v1/plant?reason=surveyed", json=tower | wrong).status_code == 422
     flat = {"declared": {"sun": {"shape": "pillbox", "half_angle_mrad": 4.65}}}
-    assert client.put("/v1/plant", json=tower | flat).json()["sun_shape"] == flat["declared"]["sun"]
+    assert (
+        client.put("/v1/plant?reason=surveyed", json=tower | flat).json()["sun_shape"]
+        == flat["declared"]["sun"]
+    )
     words = Page(client.get("/plant", headers={"Accept": "text/html"}).text).words
     assert "half angle mrad 4.65" in words
 
@@ -60,7 +63,7 @@ def test_sun_is_declared_by_its_true_circumsolar_share(client: TestClient, tower
 def test_plant_does_not_move_under_its_heliostats(client: TestClient, tower: dict[str, Any]):
     moved = copy.deepcopy(tower)
     moved["power_plant_properties"]["coordinates"][2] = 90.0
-    answer = client.put("/v1/plant", json=moved)
+    answer = client.put("/v1/plant?reason=surveyed", json=moved)
     assert answer.status_code == 409
     assert "origin is fixed" in answer.json()["detail"]
 
@@ -77,7 +80,7 @@ def test_target_by_plane(client: TestClient):
     assert created.status_code == 201
     assert created.json()["normal"] == [0, 1, 0]
     assert client.put("/v1/targets/screen", json={"plane": PLANE}).status_code == 200
-    changed = client.put("/v1/targets/screen", json={"plane": PLANE | {"width": 5}})
+    changed = client.put("/v1/targets/screen?reason=surveyed", json={"plane": PLANE | {"width": 5}})
     assert (changed.status_code, changed.json()["width"]) == (200, 5)
     assert client.get("/v1/targets/screen").json() == changed.json()
 
@@ -86,9 +89,12 @@ def test_what_locates_a_target_is_stored_with_it(client: TestClient):
     camera = {"corners_px": [[100, 80], [900, 90], [110, 700], [890, 690]]}
     client.put("/v1/targets/screen", json={"plane": PLANE, "marks": "l_brackets"})
     assert client.get("/v1/targets/screen").json()["marks"] == "l_brackets"
-    seen = client.put("/v1/targets/screen", json={"plane": PLANE, "camera": camera}).json()
+    seen = client.put(
+        "/v1/targets/screen?reason=surveyed", json={"plane": PLANE, "camera": camera}
+    ).json()
     assert (seen["marks"], seen["camera"]) == ("none", camera)
-    moved = client.put("/v1/targets/screen", json={"plane": PLANE | {"width": 5}}).json()
+    again = client.put("/v1/targets/screen?reason=surveyed", json={"plane": PLANE | {"width": 5}})
+    moved = again.json()
     assert (moved["width"], moved["camera"]) == (5, camera)
 
 
@@ -215,7 +221,12 @@ def test_heliostat_posted_twice_is_one(client: TestClient, properties: dict[str,
     )
     assert other.status_code == 409
     assert "PUT" in other.json()["detail"]
-    assert client.put("/v1/heliostats/AC43", json=properties | {"width": 3.0}).status_code == 200
+    assert (
+        client.put(
+            "/v1/heliostats/AC43?reason=surveyed", json=properties | {"width": 3.0}
+        ).status_code
+        == 200
+    )
     assert client.get("/v1/heliostats/AC43").json()["properties"]["width"] == 3.0
 
 
@@ -308,7 +319,10 @@ def test_numbers_that_are_none_are_refused_anywhere(
 def test_properties_of_the_wrong_shape(
     refusing: TestClient, properties: dict[str, Any], wrong: dict[str, Any]
 ):
-    assert refusing.put("/v1/heliostats/AA39", json=properties | wrong).status_code == 422
+    assert (
+        refusing.put("/v1/heliostats/AA39?reason=surveyed", json=properties | wrong).status_code
+        == 422
+    )
 
 
 def test_declared_effects_may_be_of_one_heliostat(client: TestClient, tower: dict[str, Any]):
@@ -319,10 +333,15 @@ def test_declared_effects_may_be_of_one_heliostat(client: TestClient, tower: dic
     }
     declared = {"effects": [rough]}
     assert (
-        client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+        client.put("/v1/plant?reason=surveyed", json=tower | {"declared": declared}).json()[
+            "declared"
+        ]
+        == declared
     )
     hazy = {"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.1}, "scope": rough["scope"]}
-    refused = client.put("/v1/plant", json=tower | {"declared": {"effects": [hazy]}})
+    refused = client.put(
+        "/v1/plant?reason=surveyed", json=tower | {"declared": {"effects": [hazy]}}
+    )
     assert refused.status_code == 422
     assert (
         "sun_shape: the sun and the camera are the same for all heliostats"
@@ -342,12 +361,17 @@ def test_declared_optics_make_the_light_of_forecasts(
     }
     assert client.post("/v1/forecasts", json=request).status_code == 201
     assert operations.forecasts[-1]["model"].optics.reflectivity == 1.0
-    bad = client.put("/v1/plant", json=tower | {"declared": {"optics": {"reflectivity": 1.5}}})
+    bad = client.put(
+        "/v1/plant?reason=surveyed", json=tower | {"declared": {"optics": {"reflectivity": 1.5}}}
+    )
     assert bad.status_code == 422
     assert "optics: reflectivity: must be less than or equal to 1" in bad.json()["detail"]
     declared = {"optics": {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}}
     assert (
-        client.put("/v1/plant", json=tower | {"declared": declared}).json()["declared"] == declared
+        client.put("/v1/plant?reason=surveyed", json=tower | {"declared": declared}).json()[
+            "declared"
+        ]
+        == declared
     )
     assert client.post("/v1/forecasts", json=request).status_code == 201
     optics = operations.forecasts[-1]["model"].optics

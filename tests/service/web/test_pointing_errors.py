@@ -156,7 +156,7 @@ def test_a_mount_that_fits_no_more_has_no_pointing_error(
     calibrate(client)
     assert client.get(PATH).status_code == 200
     properties["kinematics_properties"]["actuators"][0]["initial_angle"] += 0.01
-    client.put("/v1/heliostats/AA39", json=properties)
+    client.put("/v1/heliostats/AA39?reason=surveyed", json=properties)
     assert client.get(PATH).status_code == 404
     assert client.get("/heliostats/AA39", headers=HTML).status_code == 200
 

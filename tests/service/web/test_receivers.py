@@ -36,12 +36,12 @@ def test_receiver_comes_back_as_it_was_put(client: TestClient, name: str):
     if "panels" in found:
         assert [panel["center"] for panel in found["panels"]] == [one["center"] for one in PANELS]
     assert {item["name"] for item in client.get("/v1/receivers").json()["items"]} >= {name}
-    assert client.delete(path).status_code == 204
+    assert client.delete(f"{path}?reason=mistake").status_code == 204
 
 
 def test_receiver_may_change_its_kind(client: TestClient):
     for document in (*EVERY.values(), EVERY["board"]):
-        assert client.put("/v1/receivers/main", json=document).status_code in (200, 201)
+        assert client.put("/v1/receivers/main?reason=new", json=document).status_code in (200, 201)
         assert client.get("/v1/receivers/main").json()["kind"] == document["kind"]
     assert set(client.get("/v1/receivers/main").json()) == {
         *("name", "kind", "center", "normal", "up", "width", "height", "absorptance")
@@ -78,7 +78,7 @@ def test_receiver_that_is_not_understood_is_refused(
 
 def test_plant_document_brings_receivers_and_tower(client: TestClient, tower: dict[str, Any]):
     more = {"receivers": EVERY, "tower_size": {"radius_m": 8, "height_m": 120}}
-    answer = client.put("/v1/plant", json=tower | more)
+    answer = client.put("/v1/plant?reason=surveyed", json=tower | more)
     assert answer.status_code == 200, answer.text
     assert answer.json()["tower_size"] == {"radius_m": 8, "height_m": 120}
     names = [item["name"] for item in client.get("/v1/receivers").json()["items"]]

@@ -131,3 +131,21 @@ def test_acknowledgement_holds_while_the_warnings_are_the_same(client: TestClien
     assert (
         predict(client, "network", "2")["acknowledged_by"] is None
     )  # trusted in between: it is a new warning
+
+
+def test_undo_of_an_acknowledgement_leaves_that_of_another_version(client: TestClient):
+    assert predict(client, "network", "1", "2")["version"] == 1
+    assert acknowledge(client).status_code == 200
+    (item,) = client.get("/v1/alarms?reason=untrusted").json()["items"]
+    assert predict(client, "network", "1")["trusted"]
+    assert predict(client, "network", "2")["version"] == 3  # other warnings, from later on
+    choice = {"version": 3, "reason": "to look at it"}
+    assert client.put(f"{BASE}/current", json=choice).status_code == 200
+    answer = client.post(f"{BASE}/3/acknowledge", json={"reason": "dew"})
+    assert answer.status_code == 200, answer.text
+    undo = f"/v1/alarms/acknowledgements/{item['acknowledgement']}/undo"
+    assert client.post(undo).status_code == 200
+    seen = [client.get(f"{BASE}/{version}").json()["acknowledged_by"] for version in (1, 3)]
+    assert seen == [None, "local"]
+    (item,) = client.get("/v1/alarms?reason=untrusted").json()["items"]
+    assert item["acknowledged_reason"] == "dew"
