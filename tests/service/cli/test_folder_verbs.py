@@ -110,7 +110,7 @@ def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     measured = {
         key for key, entry in report["measurements"].items() if entry["surface"] == "measured"
     }
-    assert {key.split("/")[0] for key in measured} == {"AA39", "AC43"}
+    assert {key.split("/")[0] for key in measured} >= {"AA39", "AC43"}
     assert "AD37" in report["ideal_surfaces"]
 
 

