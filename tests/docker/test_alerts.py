@@ -24,6 +24,7 @@ from service.base.settings import Settings
 from service.store.columns import now
 from service.store.jobs import queue
 from service.store.tables import HeliostatRow
+from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app
 from tests.docker.engine import binary
 from tests.docker.files import drawn_expressions
@@ -36,6 +37,7 @@ from tests.service.conftest import (
     properties_document,
     serving,
     tower_document,
+    write_state,
 )
 from tests.service.spots import photographs
 from tests.waiting import child_process, until
@@ -140,6 +142,7 @@ def test_alert_is_delivered_and_ends_when_it_is_acknowledged(tmp_path: Path):
         service.put("/v1/heliostats/AA39", json=properties_document())
         with app.state.runtime.database.writing() as session:
             session.execute(update(HeliostatRow).values(created_at=now() - timedelta(days=40)))
+        write_state(FieldStateWriter(app.state.runtime))
         configure(tmp_path, address.removeprefix("http://"), sender, webhook)
         sends = (
             "--config.file=alertmanager.yml",

@@ -25,7 +25,9 @@ NOT_EXPORTED: dict[str, frozenset[str]] = {
     "api_keys": ALL,
     "audit": ALL,
     "sessions": ALL,
-    "forecasts": ALL,  # computed again
+    "field_state": ALL,  # computed again, as the next two
+    "forecasts": ALL,
+    "heliostat_state": ALL,
     "jobs": ALL,
     "job_steps": ALL,
     "image_totals": ALL,  # sums
