@@ -192,7 +192,7 @@ def set_up(record: Recorder, root: Path) -> None:
     body = {"type": mirror, "east_m": 12.0, "north_m": 85.0, "up_m": 0.0}
     for status in (201, 200):
         record.call("put_heliostat", "PUT /v1/heliostats/AZ99", status, json=body)
-    record.call("delete_heliostat", "DELETE /v1/heliostats/AZ99", 204)
+    record.call("delete_heliostat", "DELETE /v1/heliostats/AZ99?reason=posted+by+mistake", 204)
     record.call("list_heliostats", "GET /v1/heliostats")
     record.call("get_heliostat", "GET /v1/heliostats/AB12")
 

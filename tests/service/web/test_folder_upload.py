@@ -175,6 +175,8 @@ def stored(store_url: URL, tmp_path: Path) -> Iterator[TestClient]:
 
 def test_uploads_are_listed_and_deleted(client: TestClient, settings: Settings, folder: Path):
     name = _upload(client, zipped(folder), UPLOADS).json()["folder"]
+    noted = client.get("/v1/audit").json()["items"][0]
+    assert (noted["action"], noted["subject"]) == ("upload.received", f"upload {name}")
     (listed,) = client.get(UPLOADS).json()["items"]
     assert listed["size_bytes"] == sum(
         path.stat().st_size for path in folder.rglob("*") if path.is_file()

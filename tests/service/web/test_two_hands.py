@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL
 
+import service
 from service.base.settings import Settings
 from service.store import audit
 from service.web.app import create_app
@@ -19,6 +20,19 @@ from tests.page import Page
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, poster, sun_at
 from tests.service.web.at_once import at_once
 from tests.service.web.pages import HTML, make_key, press, text_of
+
+ROOT = Path(service.__file__).parent
+PARALLEL = {
+    "cli/demo.py": "a new study",
+    "twin/forecasts/heliostat_forecast.py": "new forecasts",
+    "twin/photographs/deletion.py": "files of deleted photographs",
+    "twin/photographs/ingest.py": "new photographs, which lock their heliostat",
+    "twin/photographs/repeats.py": "the entry of a forced photograph",
+    "twin/surfaces/prediction.py": "new surfaces, which lock their heliostat",
+    "web/root/session.py": "sessions",
+    "cli/folder_store.py": "a temporary store",
+}
+"""Modules with transactions beside changes of state, and what they write."""
 
 BASE = "/v1/heliostats/AA39/measurements"
 TAKEN = "2024-05-01T10:00:00Z"
@@ -39,6 +53,12 @@ def services(
         for name in ("AA39", "AB01"):
             assert one.put(f"/v1/heliostats/{name}", json=properties).status_code == 201
         yield [one, other]
+
+
+def test_every_change_of_state_is_a_transaction_of_its_kind():
+    files = [file for part in ("twin", "web", "cli") for file in (ROOT / part).rglob("*.py")]
+    found = {str(one.relative_to(ROOT)) for one in files if ".writing()" in one.read_text()}
+    assert found == set(PARALLEL)
 
 
 def _patch(client: TestClient, identifier: str, reason: str, **changes: Any) -> Any:
