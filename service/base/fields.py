@@ -377,10 +377,72 @@ class AccuracyOut(BaseModel):
     )
 
 
-class ReportFigures(BaseModel):
-    """Common fields of all study reports, without the effects."""
+class ReportPart(BaseModel):
+    """A part of a report, of which pages read the declared fields; others are kept."""
 
     model_config = ConfigDict(extra="allow")
+
+
+class EffectScope(ReportPart):
+    """When and at which heliostats an effect acts."""
+
+    kind: Literal["set", "since", "day"] = Field(
+        default="set", description="set: always; since: from a day on; day: by day."
+    )
+    since: date | None = Field(
+        default=None, description="Day of the first photograph after the change."
+    )
+    heliostats: list[str] | None = Field(default=None, description="null: all, or the camera.")
+
+
+class FittedParameter(ReportPart):
+    """A fitted value with its 95 % interval, also by day."""
+
+    value: Any = Field(description="A number, or numbers by heliostat.")
+    ci95: Any = Field(default=None, description="Its 95 % interval, or intervals by heliostat.")
+    unit: str = Field(default="", description="Unit of value, interval and values by day.")
+    by_day: dict[str, float] = Field(default={}, description="Values by day, if they differ.")
+
+
+class FoundEffect(ReportPart):
+    """An effect that a study found."""
+
+    name: str = Field(description="Its name in the catalogue.")
+    scope: EffectScope = Field(default=EffectScope(), description="When and where it acts.")
+    parameters: dict[str, FittedParameter] = Field(default={}, description="By name.")
+
+
+class MeanGain(ReportPart):
+    """A gain in accuracy, with its interval if it is known."""
+
+    mean: float = Field(description="Mean over held-out photographs [1].")
+
+
+class TriedEffect(ReportPart):
+    """An effect of the catalogue, fitted alone."""
+
+    name: str = Field(description="Its name in the catalogue.")
+    accuracy_after: float | None = Field(default=None, description="With it alone [1].")
+    score: float | None = Field(default=None, description="By which candidates are ranked.")
+    accuracy_gain: MeanGain | None = Field(default=None, description="Its gain in accuracy.")
+
+
+class ResidualPattern(ReportPart):
+    """Whether the residual is a pattern of the target."""
+
+    is_targets: bool = Field(default=False, description="Whether it is one of the target.")
+
+
+class Residual(ReportPart):
+    """The pattern of the remaining error."""
+
+    pattern: ResidualPattern = Field(
+        default=ResidualPattern(), description="What all photographs share."
+    )
+
+
+class StudyReport(ReportPart):
+    """The result of a study, also of `heliotwin study`. Optional parts have defaults."""
 
     verdict: Verdict = Field(
         description="effect: it is found; none: nothing is missing; unexplained: something is."
@@ -394,86 +456,16 @@ class ReportFigures(BaseModel):
         description="Share of the error beyond the noise that is left [1]."
     )
     skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")
-
-
-class StudyReport(ReportFigures):
-    """The result of a study, also of `heliotwin study`."""
-
-    effects: list[dict[str, Any]] = Field(
+    effects: list[FoundEffect] = Field(
         description=(
             "What was found: parameters with 95 % intervals, scope (when, and whose where "
             "it names `heliostats`), gain."
         )
     )
-    candidates: list[dict[str, Any]] = Field(
+    candidates: list[TriedEffect] = Field(
         description="Every effect tried by itself, the best first."
     )
-
-
-class EffectScope(BaseModel):
-    """When and at which heliostats an effect acts."""
-
-    kind: Literal["set", "since", "day"] = "set"
-    since: date | None = None
-    heliostats: list[str] | None = None
-
-
-class FittedParameter(BaseModel):
-    """A fitted value with its 95 % interval, also by day.
-
-    The value is a number, or numbers by heliostat.
-    """
-
-    value: Any
-    ci95: Any = None
-    unit: str = ""
-    by_day: dict[str, float] = {}
-
-
-class FoundEffect(BaseModel):
-    """An effect that a study found."""
-
-    name: str
-    scope: EffectScope = EffectScope()
-    parameters: dict[str, FittedParameter] = {}
-
-
-class MeanGain(BaseModel):
-    """A gain in accuracy without its interval."""
-
-    mean: float
-
-
-class TriedEffect(BaseModel):
-    """An effect of the catalogue, fitted alone."""
-
-    name: str
-    accuracy_after: float | None = None
-    score: float | None = None
-    accuracy_gain: MeanGain | None = None
-
-
-class ResidualPattern(BaseModel):
-    """Whether the residual is a pattern of the target."""
-
-    is_targets: bool = False
-
-
-class Residual(BaseModel):
-    """The pattern of the remaining error."""
-
-    pattern: ResidualPattern = ResidualPattern()
-
-
-class CheckedStudyReport(ReportFigures):
-    """A study report for its page, with the open parts of `StudyReport` checked.
-
-    Optional parts have defaults.
-    """
-
-    effects: list[FoundEffect]
-    candidates: list[TriedEffect]
-    residual: Residual = Residual()
+    residual: Residual = Field(default=Residual(), description="What is left.")
 
 
 class MountReport(BaseModel):

@@ -52,7 +52,7 @@ from service.twin.forecasts.heliostat_forecast import ForecastRequest, make_fore
 from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime import operations
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.study import StudyRequest, study_row, study_store
+from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
 from service.twin.transfer.importing import import_folder
 
@@ -208,7 +208,7 @@ def _study(runtime: Runtime, bars: Progress) -> dict[str, str | None]:
     """
     task = bars.add_task("study what the model lacks", total=1)
     try:
-        studied = study_store(runtime, StudyRequest())
+        studied = study_store(runtime, StudyIn())
     except ConflictError as error:
         return {"verdict": None, "conclusion": str(error)}
     row = study_row(

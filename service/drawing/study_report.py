@@ -104,7 +104,25 @@ def _value(parameter: Parameter, value: float, ci95: tuple[float, float]) -> Fit
 def study_page(
     study: Study, title: str, ends: Mapping[str, float], skipped: Mapping[str, str] | None = None
 ) -> str:
-    """The report of a study as one self-contained HTML page.
+    """The report of a study as one self-contained HTML page; parameters as of `study_body`."""
+    return report_page(
+        study_body(study, title, ends, skipped), f"{title}: {VERDICTS[study.verdict]}"
+    )
+
+
+def report_page(body: str, title: str, crumbs: str = "heliotwin study") -> str:
+    """A page around the ``body`` of a report; markup in ``crumbs`` is kept if it is `Markup`."""
+    # The style is a trusted file, so it is not escaped: CSS needs `>`.
+    style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
+    return TEMPLATES.get_template("report.html").render(
+        style=style, body=Markup(body), title=title, crumbs=crumbs
+    )
+
+
+def study_body(
+    study: Study, title: str, ends: Mapping[str, float], skipped: Mapping[str, str] | None = None
+) -> str:
+    """The content of a study's report as HTML.
 
     Parameters
     ----------
@@ -118,10 +136,7 @@ def study_page(
     chart, sides = accuracy_chart(study), (study.window, study.window)
     mean = "Mean of forecast minus photograph"
     left = difference_map(mean, study.residual_map(), sides, "of peak", ends["mean_difference"])
-    # The style is a trusted file, so it is not escaped: CSS needs `>`.
-    style = Markup(ASSETS.joinpath("app.css").read_text(encoding="utf-8"))
     return TEMPLATES.get_template("study.html").render(
-        style=style,
         study=study,
         conclusion=conclude(study),
         title=title,

@@ -520,7 +520,7 @@ class StudyRow(Base):
 
     - ``model`` is the number of the plant's model at that time.
     - ``report`` is that of `model.study.study_to_json`.
-    - ``html`` is the report as a page. A report imported from a file has none.
+    - ``html`` is the content of its report page. A report imported from a file has none.
     - ``first_taken_at`` and ``last_taken_at`` are the times of its first and last photograph.
     """
 

@@ -83,9 +83,12 @@ def collect_routes(kinds: Kinds) -> list[BaseRoute]:
     v1.include_router(
         jobs.creators(kinds)
     )  # before the routes of a job, which would read the names of kinds as numbers
-    for resource in modules_of("service.web.api"):
+    resources = [one for one in modules_of("service.web.resources") if hasattr(one, "router")]
+    for resource in (*modules_of("service.web.api"), *resources):
         v1.include_router(resource.router)
     root.include_router(v1)
+    for resource in resources:
+        root.include_router(resource.pages)
     for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
         if hasattr(place, "router"):
             root.include_router(place.router)

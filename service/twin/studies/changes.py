@@ -111,16 +111,18 @@ class Changes:
         return max((change.peak for change in self.of), key=abs)
 
 
-def heliostats_to_forecast(study: StudyRow) -> Sequence[str]:
-    """Heliostats of a study whose forecasts show the change, spread over those that it has."""
-    step = -(-len(study.heliostats) // MAX_HELIOSTATS)
-    return study.heliostats[:: max(step, 1)]
+def heliostats_to_forecast(studied: Sequence[str]) -> Sequence[str]:
+    """Those of the studied heliostats whose forecasts show the change, spread over all."""
+    step = -(-len(studied) // MAX_HELIOSTATS)
+    return studied[:: max(step, 1)]
 
 
-def forecast_changes(runtime: Runtime, study: StudyRow) -> Changes:
+def forecast_changes(runtime: Runtime, number: int) -> Changes:
     """Forecast a study's heliostats by the current model, and by the one after its adoption."""
     changes = Changes()
-    for name in heliostats_to_forecast(study):
+    with runtime.database.reading() as session:
+        study = store.get_study(session, number)
+    for name in heliostats_to_forecast(study.heliostats):
         try:
             changes.of.append(_change(runtime, study, name))
         except SKIPPED as error:

@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.effects import effects_from_json
+from model.effects import CATALOGUE, effects_from_json
 from model.errors import InvalidInputError, UnreachableError
 from model.forecast import align
 from model.frames import wgs84_to_enu
@@ -24,10 +24,10 @@ from model.surface import DEGREE, control_points
 from service import store
 from service.base.arrays import to_json_value
 from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
-from service.base.fields import CheckedStudyReport
+from service.base.fields import Model, Moment, Name, StudyReport, Text, Whole
 from service.base.progress import Report, Steps, no_report
 from service.base.validation_messages import format_validation_error
-from service.drawing.study_report import study_page
+from service.drawing.study_report import study_body
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     HeliostatContext,
@@ -45,23 +45,72 @@ from service.twin.studies.known_neighbours import load_neighbours, with_neighbou
 Surfaces = Literal["measured", "current"]
 
 
-@dataclass(frozen=True)
-class StudyRequest:
-    """Photographs and effects to study.
+MAX_STUDY_IMAGES = 400  # bounds the memory of a study
 
-    ``heliostats`` are names; by default ``max_heliostats`` are spread over the field. ``surfaces``
-    is "measured" or "current". "current" is the measured surface if there is one, else the active
-    one. At most ``images`` are taken of each heliostat, from ``since`` until before ``until``.
-    ``candidates`` are effects of the catalogue, by default all.
-    """
 
-    heliostats: Sequence[str] | None = None
-    surfaces: Surfaces = "current"
-    images: int = 12
-    max_heliostats: int = 12
-    since: datetime | None = None
-    until: datetime | None = None
-    candidates: Sequence[str] | None = None
+class StudyIn(Model):
+    """Find the effect that stored photographs show and the plant's current model lacks."""
+
+    heliostats: list[Name] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=200,
+        description="Names of heliostats; else some of all over the field.",
+    )
+    max_heliostats: Whole = Field(
+        default=12,
+        ge=1,
+        le=200,
+        description="How many heliostats to take where none is named, near ones and far ones.",
+    )
+    surfaces: Surfaces = Field(
+        default="current",
+        description=(
+            "measured: only heliostats with a measured surface; current: where there is none, the"
+            " newest prediction."
+        ),
+    )
+    images: Whole = Field(
+        default=12,
+        ge=2,
+        le=64,
+        validate_default=True,
+        description=(
+            "Most photographs of each heliostat: the newest ones, spread over the sun's positions."
+            f" {MAX_STUDY_IMAGES} of all heliostats together."
+        ),
+    )
+    since: Moment | None = Field(
+        default=None, description="Only photographs from then on (time with zone)."
+    )
+    until: Moment | None = Field(
+        default=None, description="Only photographs before then (time with zone)."
+    )
+    candidates: list[Text] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=100,
+        description="Names of the effects to try; all without it.",
+    )
+
+    @field_validator("candidates")
+    @classmethod
+    def _known(cls, names: list[str] | None) -> list[str] | None:
+        if names is not None and not set(names) <= set(CATALOGUE):
+            raise ValueError(f"the catalogue of effects has {', '.join(CATALOGUE)}")
+        return None if names is None else list(dict.fromkeys(names))
+
+    @field_validator("images")
+    @classmethod
+    def _not_too_many(cls, images: int, info: ValidationInfo) -> int:
+        named = info.data.get("heliostats")
+        count = info.data.get("max_heliostats", 1) if named is None else len(set(named))
+        if count * images > MAX_STUDY_IMAGES:
+            raise ValueError(
+                f"{count * images} in all, {MAX_STUDY_IMAGES} at most; ask for"
+                f" {MAX_STUDY_IMAGES // count} of each heliostat, or for fewer heliostats"
+            )
+        return images
 
 
 @dataclass(eq=False)
@@ -101,7 +150,7 @@ class StudyInputs:
         return replace(self, photographs=traceable, skipped=skipped)
 
 
-def load_study_inputs(session: Session, request: StudyRequest) -> StudyInputs:
+def load_study_inputs(session: Session, request: StudyIn) -> StudyInputs:
     """Load the photographs of a request, and the surfaces of their mirrors.
 
     Raises
@@ -131,7 +180,7 @@ class StudyExtent:
         return sum(self.photographs.values())
 
 
-def extent_of(session: Session, request: StudyRequest) -> StudyExtent:
+def extent_of(session: Session, request: StudyIn) -> StudyExtent:
     """Count what a request would study, without loading photographs.
 
     Raises
@@ -150,12 +199,12 @@ def extent_of(session: Session, request: StudyRequest) -> StudyExtent:
 
 
 def _chosen_measurements(
-    session: Session, row: HeliostatRow, request: StudyRequest
+    session: Session, row: HeliostatRow, request: StudyIn
 ) -> list[MeasurementRow]:
     return choose_measurements(session, row, request.images, request.since, request.until)
 
 
-def _chosen_heliostats(session: Session, request: StudyRequest) -> Sequence[HeliostatRow]:
+def _chosen_heliostats(session: Session, request: StudyIn) -> Sequence[HeliostatRow]:
     """The named heliostats, else a selection with photographs and a surface.
 
     The selection is spread evenly over the distance from the tower.
@@ -188,7 +237,7 @@ def _surface(session: Session, heliostat: HeliostatRow, surfaces: Surfaces) -> S
 
 
 def _load_heliostat_inputs(
-    session: Session, row: HeliostatRow, request: StudyRequest, material: StudyInputs
+    session: Session, row: HeliostatRow, request: StudyIn, material: StudyInputs
 ) -> None:
     twin = load_heliostat_context(session, row.name)
     surface = _surface(session, row, request.surfaces)
@@ -249,13 +298,13 @@ def _require_on_target(twin: HeliostatContext, row: MeasurementRow) -> None:
 class StoredStudy:
     """A study with its inputs."""
 
-    request: StudyRequest
+    request: StudyIn
     model: ModelVersion
     material: StudyInputs
     study: "Study"
 
 
-def study_store(runtime: Runtime, request: StudyRequest, report: Report = no_report) -> StoredStudy:
+def study_store(runtime: Runtime, request: StudyIn, report: Report = no_report) -> StoredStudy:
     """Find effects that stored photographs require beyond the plant's current model.
 
     ``report`` receives the progress and the current fit. An exception that it raises stops the
@@ -307,7 +356,7 @@ def study_row(
     actor: str,
     scales: Mapping[str, float],
 ) -> StudyRow:
-    """The row of a study, with its report page.
+    """The row of a study, with the content of its report page.
 
     ``options`` are the requested options as JSON. ``scales`` are the upper ends of the maps' colour
     scales (`Settings.figure_scales`).
@@ -326,7 +375,7 @@ def study_row(
         conclusion=report["conclusion"],
         report=report,
         skipped=material.skipped,
-        html=study_page(studied.study, title, scales, material.skipped),
+        html=study_body(studied.study, title, scales, material.skipped),
     )
 
 
@@ -354,7 +403,7 @@ def model_of_report(session: Session, document: Any, name: str) -> ModelVersion:
     return found
 
 
-def parse_report(document: Any, name: str) -> CheckedStudyReport:
+def parse_report(document: Any, name: str) -> StudyReport:
     """Parse a report of `heliotwin study`, read from the file ``name``.
 
     Raises
@@ -363,7 +412,7 @@ def parse_report(document: Any, name: str) -> CheckedStudyReport:
         If it is not such a report.
     """
     try:
-        report = CheckedStudyReport.model_validate(document)
+        report = StudyReport.model_validate(document)
     except ValidationError as error:
         raise InvalidInputError(f"{name}: {format_validation_error(error, 'report')}") from None
     effects_from_json(document["effects"])

@@ -30,9 +30,9 @@ from service import store
 from service.base.arrays import unpack_untrusted
 from service.base.fields import (
     CheckedMountReport,
-    CheckedStudyReport,
     Name,
     Source,
+    StudyReport,
     Sun,
     Text,
     Verdict,
@@ -133,7 +133,7 @@ def _check_models(models: Any, path: Path) -> None:
     parse_declared(models.declared or {}, f"{path}: declared")
     for study in models.studies:
         where = f"{path}: study {study.number}"
-        _check_report(study.report, CheckedStudyReport, where)
+        _check_report(study.report, StudyReport, where)
         _check_effects(study.report["effects"], where)
     for model in models.models:
         where = f"{path}: version {model.number}"

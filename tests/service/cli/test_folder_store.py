@@ -18,7 +18,7 @@ from service.cli.folder_study import photographs_of
 from service.sources.folder import read_folder
 from service.twin.pointing.calibration import calibrate_store
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.study import StudyRequest, load_study_inputs
+from service.twin.studies.study import StudyIn, load_study_inputs
 from service.twin.surfaces.prediction import predict_surface
 from service.twin.transfer.importing import import_folder
 from tests.service.conftest import QUIET
@@ -42,7 +42,7 @@ def test_folder_and_store_are_one_plant(pair_plant: Path, stored: Runtime, tmp_p
     with open_folder(folder) as opened:
         photographs, skipped = photographs_of(opened)
     with stored.database.reading() as session:
-        inputs = load_study_inputs(session, StudyRequest(surfaces="measured"))
+        inputs = load_study_inputs(session, StudyIn(surfaces="measured"))
     assert skipped == inputs.skipped == {}
     by_key = {one.key: one for one in inputs.photographs}
     assert by_key.keys() == {one.key for one in photographs}

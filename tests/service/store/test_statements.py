@@ -13,7 +13,7 @@ from service.store.photographs.image_files import ImageStore
 from service.store.recovery.check import inspect_store
 from service.twin.heliostats.measurements import named_measurements
 from service.twin.plant import model_versions
-from service.twin.studies.study import StudyRequest, load_study_inputs
+from service.twin.studies.study import StudyIn, load_study_inputs
 from service.twin.surfaces.accuracy import held_out_first
 from tests.service.statements import statements
 from tests.service.store.rows import fill
@@ -52,7 +52,7 @@ def test_study_asks_as_often_for_many_photographs_as_for_few(database: Database)
     asked = []
     for images in (2, 12):
         with database.reading() as session, statements(database) as sent:
-            material = load_study_inputs(session, StudyRequest(heliostats=["AA39"], images=images))
+            material = load_study_inputs(session, StudyIn(heliostats=["AA39"], images=images))
         assert len(material.photographs) + len(material.skipped) == images
         asked.append(len(sent))
     assert asked[0] == asked[1]

@@ -37,7 +37,7 @@ from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin.runtime.runtime import Operations, Runtime
 from service.twin.runtime.slots import ComputeSlots
-from service.twin.studies.study import StudyRequest, load_study_inputs, study_store
+from service.twin.studies.study import StudyIn, load_study_inputs, study_store
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of, until
 from tests.service.twin.fields import heights
@@ -239,7 +239,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
 
 def test_photograph_shows_its_heliostat_with_the_stored_surface(filled: Database):
     with filled.reading() as session:
-        material = load_study_inputs(session, StudyRequest(heliostats=["AB12"]))
+        material = load_study_inputs(session, StudyIn(heliostats=["AB12"]))
         row = store.get_surface(session, store.get_heliostat(session, "AB12"), 1)
     assert material.heliostats == ["AB12"]
     assert not material.skipped
@@ -279,7 +279,7 @@ def test_study_lets_others_at_the_model_between_its_steps(filled: Database, tmp_
         operations,
         compute_slots=ComputeSlots(1),
     )
-    study_store(runtime, StudyRequest(surfaces="measured"))
+    study_store(runtime, StudyIn(surfaces="measured"))
     assert order == ["step one", "a request", "step two"]
     with runtime.compute_slots.slot(0.0):
         pass
@@ -288,9 +288,9 @@ def test_study_lets_others_at_the_model_between_its_steps(filled: Database, tmp_
 def test_time_and_number_of_photographs_are_bounded(filled: Database):
     since, until = BEGIN + timedelta(days=1), BEGIN + timedelta(days=4)
     with filled.reading() as session:
-        material = load_study_inputs(session, StudyRequest(since=since, until=until))
-        few = load_study_inputs(session, StudyRequest(images=2, max_heliostats=1))
-        none = load_study_inputs(session, StudyRequest(until=BEGIN))
+        material = load_study_inputs(session, StudyIn(since=since, until=until))
+        few = load_study_inputs(session, StudyIn(images=2, max_heliostats=1))
+        none = load_study_inputs(session, StudyIn(until=BEGIN))
     assert sorted(p.key for p in material.photographs) == [
         f"{h}/{h}{day}" for h in sorted(FIELD) for day in (1, 2, 3)
     ]
@@ -314,8 +314,8 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
         assert measured is not None
         session.delete(measured)
     with database.reading() as session:
-        both = load_study_inputs(session, StudyRequest())
-        only = load_study_inputs(session, StudyRequest(surfaces="measured", heliostats=list(FIELD)))
+        both = load_study_inputs(session, StudyIn())
+        only = load_study_inputs(session, StudyIn(surfaces="measured", heliostats=list(FIELD)))
     assert (both.heliostats, only.heliostats) == (["AB12", "AK08"], ["AB12"])
     assert "no measured surface" in only.skipped["AK08"]
     depth = {p.heliostat: np.ptp(p.setup.control_points[0, :, :, 2]) for p in both.photographs}
@@ -326,7 +326,7 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
 
 def test_photograph_that_cannot_have_been_is_left_out_by_name(filled: Database):
     with filled.reading() as session:
-        material = load_study_inputs(session, StudyRequest())
+        material = load_study_inputs(session, StudyIn())
     whole, behind = material.photographs[0], material.photographs[1]
     shot = replace(behind.setup, plane=replace(TARGET, normal=-TARGET.normal))
     odd = replace(material, photographs=[whole, replace(behind, setup=shot)])
@@ -358,7 +358,7 @@ def test_centred_flux_needs_a_spot_on_its_target(
         about.focal_spot_wgs84, about.kind = None if spot is None else list(spot), "flux-centered"
         store.add_measurement(session, row, image, about)
         material = load_study_inputs(
-            session, StudyRequest(heliostats=["AB12"], since=BEGIN + timedelta(days=19))
+            session, StudyIn(heliostats=["AB12"], since=BEGIN + timedelta(days=19))
         )
     if reason is not None:
         assert reason in material.skipped["AB12/centred"]

@@ -21,7 +21,7 @@ from model.surface import control_points
 from model.tracing.convolution import central_rays
 from service.base.settings import Settings
 from service.sources.documents import read_heliostat
-from service.twin.studies.study import StudyRequest, load_study_inputs
+from service.twin.studies.study import StudyIn, load_study_inputs
 from tests.page import Page
 from tests.service.conftest import ORIGIN, QUIET, FakeOperations, Post, png, until
 from tests.service.spots import calibrate, photographs
@@ -220,7 +220,7 @@ def test_photographs_newer_than_a_mount_say_to_a_study_where_motors_sent_the_lig
         post(png(number), **one)
     client.post("/v1/heliostats/AA39/surfaces", json={})
     with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
-        material = load_study_inputs(session, StudyRequest(heliostats=["AA39"], images=16))
+        material = load_study_inputs(session, StudyIn(heliostats=["AA39"], images=16))
     known = [p for p in material.photographs if p.setup.angles is not None]
     assert len(material.photographs) == 16
     assert {p.key for p in known} == {"AA39/14", "AA39/15"}

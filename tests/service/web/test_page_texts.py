@@ -35,6 +35,7 @@ from tests.service.web.plans import DAY, DRUM
 from tests.waiting import until
 
 MASKS = {
+    r"(?: \N{MIDDLE DOT} )?[^\[\]\n\N{MIDDLE DOT}]*\[/docs/guide[^\]]*\]": "",  # if it is built
     r"/\S*/texts\d+/": "/",
     r"htw_\w+": "htw_(key)",
     r"\b(?=[a-f]*\d)[0-9a-f]{8,64}\b": "(digest)",

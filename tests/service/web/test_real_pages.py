@@ -23,13 +23,7 @@ from model.study.parameters import ParameterVector, Term
 from service import store
 from service.base.settings import FIGURE_SCALES
 from service.twin.plant import model_versions
-from service.twin.studies.study import (
-    StoredStudy,
-    StudyInputs,
-    StudyRequest,
-    row_of_report,
-    study_row,
-)
+from service.twin.studies.study import StoredStudy, StudyIn, StudyInputs, row_of_report, study_row
 from tests.model.scenes import photographs
 from tests.page import Page
 from tests.service import real
@@ -119,7 +113,7 @@ def every_study(real_store: Path, tmp_path_factory: pytest.TempPathFactory) -> I
             model = model_versions.get_model(session)
             for index, made in enumerate(studies()):
                 studied = StoredStudy(
-                    StudyRequest(), model, StudyInputs(skipped={"AB38": "no surface"}), made
+                    StudyIn(), model, StudyInputs(skipped={"AB38": "no surface"}), made
                 )
                 store.add_study(
                     session, study_row(studied, f"Study {index}", {}, "tester", FIGURE_SCALES)

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from datetime import datetime, time
 from zoneinfo import ZoneInfo
 
-from service.base.fields import CheckedStudyReport
+from service.base.fields import StudyReport
 from service.drawing.timelines import TimeAxis, Timeline, Value, timeline
 
 
 def study_timelines(
-    report: CheckedStudyReport, taken: Mapping[str, datetime | None], zone: str
+    report: StudyReport, taken: Mapping[str, datetime | None], zone: str
 ) -> list[Timeline]:
     """Charts with a known time; ``taken`` has the times of photographs by ``heliostat/id``."""
     axis = TimeAxis(zone)

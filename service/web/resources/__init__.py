@@ -1,0 +1,1 @@
+"""Resources: each answers REST and browsers from the same functions and models."""
