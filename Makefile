@@ -27,6 +27,9 @@ install: $(VENV)/installed ## the virtual environment with everything in it; dem
 demo: $(VENV)/runtime ## photographs in, mirror surfaces and flux forecasts out, under out/demo
 	$(BIN)/heliotwin demo $(ARGS)
 
+# Compiled modules are kept, whatever the environment says: without them each process compiles them again.
+test test-all coverage: export PYTHONDONTWRITEBYTECODE =
+
 test: install ## what a change needs: units, routes, pages, one task of each user, on SQLite (5 minutes)
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not full" $(ARGS)
 

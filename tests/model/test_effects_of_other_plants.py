@@ -172,7 +172,7 @@ RIVALS = {
 @pytest.mark.parametrize(
     "name",
     [
-        name if name in ("slope_error", "axis_tilt") else pytest.param(name, marks=pytest.mark.full)
+        name if name == "slope_error" else pytest.param(name, marks=pytest.mark.full)
         for name in RIVALS
     ],
 )

@@ -85,6 +85,7 @@ def test_the_answer_keeps_facet_means_and_its_spread_is_positive(network):
     assert (spread > 0).all()
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings(
     "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore:# The axis name"
 )

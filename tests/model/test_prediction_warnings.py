@@ -75,6 +75,7 @@ def test_a_facet_that_was_knocked_is_named():
     assert said.startswith("facet 3 is canted")
 
 
+@pytest.mark.full
 def test_a_facet_without_light_is_named():
     """Though a bent surface explains the photographs nearly as well."""
     heliostat, prior = near(), default_prior()

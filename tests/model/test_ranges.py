@@ -44,6 +44,7 @@ def test_the_true_mirror_explains_photographs_that_were_cut_off(taken):
     assert clipped[0].clipped_share > 0.6 > whole[0].clipped_share == 0
 
 
+@pytest.mark.full
 def test_a_refinement_is_not_misled_by_what_was_cut_off(taken):
     z, _, clipped = taken
     options = RefinementOptions(rounds=1)

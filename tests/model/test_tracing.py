@@ -203,11 +203,12 @@ def test_area_weights_make_flux_independent_of_the_parametrisation():
             10_000_000,
             marks=pytest.mark.full,
         ),
-        (
+        pytest.param(
             (60.0, 120.0, 1.8),
             (-60.0, 20.0),
             Optics(sun_shape=Pillbox(), slope_error=1e-3),
             3_000_000,
+            marks=pytest.mark.full,
         ),
         # Near, with the facets at different distances and the beam steep on the plane.
         ((8.0, 18.0, 1.8), (40.0, 55.0), Optics(sun_shape=Buie(0.02)), 3_000_000),

@@ -242,7 +242,13 @@ TYPES = {
 }
 
 
-@pytest.mark.parametrize("kind", TYPES.values(), ids=TYPES)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, id=name, marks=[pytest.mark.full] if name == "round" else [])
+        for name, kind in TYPES.items()
+    ],
+)
 def test_facets_of_any_outline_and_focus_against_monte_carlo(kind: HeliostatType):
     scene, window = _scene(kind), Window.of(BOARD, 36, 40)
     found = trace(scene, window, OPTICS, samples=24)

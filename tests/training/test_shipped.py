@@ -20,10 +20,8 @@ COUNT = 14
 """Two places of each test mirror."""
 
 
-@pytest.mark.parametrize(
-    ("camera", "max_mm"),
-    [pytest.param(CleanCamera(), 0.125, marks=pytest.mark.full), (Camera(), 0.145)],
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("camera", "max_mm"), [(CleanCamera(), 0.125), (Camera(), 0.145)])
 def test_shipped_weights_predict_test_mirrors_as_well_as_it_is_said(stj, camera, max_mm):
     surfaces, names = load_part(stj, "test")
     cases = make_cases(surfaces, names, load_field(stj), COUNT, camera)

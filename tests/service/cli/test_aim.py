@@ -52,7 +52,10 @@ def field(plant: Path, out: Path, receiver: str, *options: object) -> dict[str, 
     return figures
 
 
-@pytest.mark.parametrize(("receiver", "resolution"), [("main", (32, 80)), ("board", (32, 32))])
+@pytest.mark.parametrize(
+    ("receiver", "resolution"),
+    [("main", (32, 80)), pytest.param("board", (32, 32), marks=pytest.mark.full)],
+)
 def test_aims_give_what_their_report_says(
     plant: Path, tmp_path: Path, receiver: str, resolution: tuple[int, int]
 ):
@@ -90,6 +93,7 @@ def test_light_enters_a_cavity_and_its_panels_stay_under_the_limit(plant: Path, 
     assert all("behind" in why or "faces away" in why for why in report["skipped"].values())
 
 
+@pytest.mark.full
 def test_plans_begin_with_aims_of_a_moment_before(plant: Path, tmp_path: Path):
     first = aimed(plant, tmp_path, "board", 900)
     again = aimed(plant, tmp_path, "board", 900, "--start", tmp_path / "aims.csv")

@@ -26,6 +26,7 @@ def taken_through(law: Transfer, source: Path, root: Path) -> Path:
     return root
 
 
+@pytest.mark.full
 def test_srgb_stays_where_it_is_no_worse(pair_plant, tmp_path):
     out = tmp_path / "new" / "camera.json"
     done = heliotwin("camera", pair_plant, "--out", out)

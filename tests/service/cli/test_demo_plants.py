@@ -57,6 +57,7 @@ def test_mirrors_of_a_plants_file_are_photographed_and_found(tmp_path: Path):
         assert (out / picture).is_file()
 
 
+@pytest.mark.full
 def test_second_embedded_plant_is_what_juelich_is_not(tmp_path: Path):
     file = write_southern_plant(tmp_path / "southern")
     demonstrated = Demonstrated.read(file, 1)

@@ -114,6 +114,7 @@ def test_forecast_reaches_the_goal_on_real_images(stj, tmp_path):
     assert "AD37" in report["ideal_surfaces"]
 
 
+@pytest.mark.full
 def test_heliostats_without_a_surface_are_forecast_as_ideal_mirrors(pair_plant, tmp_path):
     """They were skipped; the service forecasts them in the same way."""
     root = tmp_path / "plant"
@@ -198,6 +199,7 @@ def test_no_effect_of_a_camera_makes_light(single_plant, tmp_path, effects):
             assert np.array_equal(made["flux"], made["camera_view"]) == (effects != [SHOULDER])
 
 
+@pytest.mark.full
 def test_effects_of_a_studys_report_are_added_to_the_declared_ones(single_plant, tmp_path):
     sigma = {"sigma_mrad": {"value": 2.0, "ci95": [1.9, 2.1], "unit": "mrad"}}
     found = {"verdict": "effect", "effects": [{"name": "slope_error", "parameters": sigma}]}
@@ -298,6 +300,7 @@ def test_every_verb_has_help():
         assert "--json" in done.stdout
 
 
+@pytest.mark.full
 def test_a_heliostat_without_images_is_skipped_with_its_reason(made_plant, tmp_path):
     import shutil
 

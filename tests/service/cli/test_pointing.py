@@ -145,6 +145,7 @@ def test_spots_need_no_focal_spot(folder: Path, tmp_path: Path):
     assert entry["target"] == "lower"
 
 
+@pytest.mark.full
 def test_verbs_stand_on_the_mounts_of_a_file(folder: Path, tmp_path: Path):
     """Without a spot the light of the motors lands where it was seen, and not 29 mrad away; with
     one it is rolled.

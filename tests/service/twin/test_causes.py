@@ -117,6 +117,7 @@ def test_few_suns(stj: Path, years: Path, tmp_path: Path):
     assert "Plan photographs under other suns" in few
 
 
+@pytest.mark.full
 def test_hazy_day(stj: Path, years: Path, tmp_path: Path):
     """Photographs that arrive one by one, of two mirrors: the first day is hazy for both."""
     folder = tmp_path / "import" / "plant"

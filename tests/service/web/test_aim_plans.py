@@ -230,6 +230,7 @@ def test_exceeded_plan_gets_new_aims_in_the_browser(plant: TestClient):
     assert "kept at all times" in kept.words
 
 
+@pytest.mark.full
 def test_aims_are_found_under_a_map_of_limits(plant: TestClient):
     """From the form alone, without a plan before."""
     form = {"name": "June", "target": "main", "limit_map_kw_m2": "200 200\n70, 70"}
@@ -370,6 +371,7 @@ def outdated(client: TestClient) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.full
 def test_a_change_since_todays_plan_raises_an_alarm_until_a_new_plan(plant: TestClient):
     noon = now().astimezone(ZoneInfo("Europe/Madrid")).replace(hour=13, minute=0, second=0)
     today = BODY | {"sun": {"at": noon.isoformat()}, "heliostats": some_names(plant)}

@@ -55,6 +55,7 @@ def test_an_effect_of_the_light_and_what_its_adoption_would_change(studied: Stud
     assert forecast == pytest.approx(after)
 
 
+@pytest.mark.full
 def test_nothing_missing_and_not_explained_have_nothing_to_adopt(studied: Studied):
     client = studied(2, "slope_error")
     for path in ("/studies/1", "/studies"):
@@ -62,6 +63,7 @@ def test_nothing_missing_and_not_explained_have_nothing_to_adopt(studied: Studie
     assert "changes nothing" in client.get("/studies/1/change").json()["detail"]
 
 
+@pytest.mark.full
 def test_not_explained(studied: Studied):
     client = studied(3, "sun_shape")
     assert client.get("/v1/studies/1").json()["state"] == "nothing_to_adopt"
