@@ -25,6 +25,7 @@ from sqlalchemy.orm import Session
 
 from benchmarks import data_folder
 from benchmarks.record import log_row, recording
+from model.fleet import Losses
 from model.imaging import ImageKind, MeasuredFlux
 from model.imaging.quality import refused
 from service import store
@@ -44,6 +45,7 @@ from service.store.recovery.backup import images_of
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
 from service.twin.alarms.field_overview import read_summaries
+from service.twin.forecasts.watts import light_watts
 from service.twin.photographs.ingest import measurement_row
 from service.twin.runtime import operations
 from tests.faults.harness import new_store
@@ -244,6 +246,7 @@ class Filler:
             at,
         )
         row.sun_azimuth_deg, row.sun_elevation_deg, row.dni_w_m2 = 200.0, 45.0, 1000.0
+        row.losses = dict(light_watts(Losses(8.2, *[0.9] * 7), row.dni_w_m2))
         row.normalised, row.rows, row.columns, row.peak_w_m2, row.power_w = (
             False,
             256,

@@ -76,5 +76,6 @@ def _forecast(heliostat: HeliostatRow, surface: SurfaceRow) -> ForecastRow:
         columns=8,
         model_version="1:none",
         flux=b"",
+        losses={},
         **dict.fromkeys(numbers, 1.0),
     )
