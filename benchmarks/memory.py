@@ -5,18 +5,24 @@ Starts the real service on a store of 20,000 heliostats and of two real mirrors 
 Juelich. Sends one input after the other, waits for its answer or for the end of its job, and prints
 the peak of each: the service's (``VmHWM``, which is reset before), and its child processes' with
 the memory that they share with it. No sum may pass 2.5 GB (2500 MB). ``--only WORD ..`` sends those
-whose names have one of these words. Linux only.
+whose names have one of these words, and records them in ``results/memory-WORD-...json``.
+
+``--pages STORE`` reads the pages of a store for two minutes instead, such as those of ``heliotwin
+demo`` in ``out/demo/store-field``, and prints the memory before, meanwhile and after
+(``results/memory-pages.json``). Linux only.
 """
 
 import argparse
 import io
 import json
+import re
 import struct
 import sys
 import tempfile
 import threading
 import time
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -34,7 +40,7 @@ from benchmarks.load import import_two
 from benchmarks.record import Estimate, log_row, recording
 from service.sources.files import MAX_JSON_VALUES
 from service.store.database import Database, migrate
-from tests.faults.harness import Process, new_store
+from tests.faults.harness import Process, Store, new_store
 from tests.service.conftest import metadata_of
 
 BOUND_MB = 2500.0
@@ -301,7 +307,7 @@ def aims(heliostats: int, side: int, times: int = 1, steps: int = 1) -> Send:
                 heliostats=[f"H{number:05d}" for number in range(heliostats)],
                 resolution=[side, side],
                 day={"date": "2026-06-21"} | minutes,
-                limit_w_m2=(5 + number) * 1e3 * heliostats,
+                limit_w_m2=min(5e7, (5 + number) * 1e3 * heliostats),
                 neighbours=False,
             )(http)
 
@@ -440,9 +446,9 @@ def inputs(root: Path) -> dict[str, Send]:
             "forecasts", ("/v1/jobs/{}/flux", "/jobs/{}"), target=TARGET, **own
         ),
         "aims of 2,650 heliostats, 1024 x 1024": aims(2650, 1024),
-        "aims of 2,650 heliostats, 137 x 137": aims(2650, 137),
-        "aims of 20,000 heliostats, 50 x 50": aims(20_000, 50),
-        "aims of 47 heliostats, 1024 x 1024, twice": aims(47, 1024, times=2, steps=2),
+        "aims of 2,650 heliostats, 128 x 128": aims(2650, 128),
+        "aims of 20,000 heliostats, 46 x 46": aims(20_000, 46),
+        "aims of 41 heliostats, 1024 x 1024, twice": aims(41, 1024, times=2, steps=2),
         "import of an npz of 5.8 MB": imported(root, npz_bomb),
         "import of an h5 of declared 10^10 points": imported(root, h5_bomb),
         "import of an h5 of 4 x 500,000 points": imported(root, largest_h5),
@@ -455,6 +461,52 @@ def inputs(root: Path) -> dict[str, Send]:
         "study of 2 x 64 images": job("studies", heliostats=["AA39", "AC43"], images=64),
         "study of 6 x 64 images": job("studies", heliostats=list(PHOTOGRAPHED), images=64),
     }
+
+
+READ_S, READERS, LATER_S = 120.0, 3, 60.0
+"""Seconds of reading pages, by so many readers, and seconds after that."""
+
+MOST_ALIKE = 40
+"""Pages that a reader opens of those whose paths differ by numbers and names only."""
+
+
+def read_pages(base: str) -> int:
+    """Follow the links of pages for `READ_S`, from the first page again at their end; their
+    number.
+    """
+    until, read = time.monotonic() + READ_S, 0
+    with httpx.Client(base_url=base, headers={"Accept": "text/html, */*"}, timeout=60) as http:
+        while time.monotonic() < until:
+            ahead, alike = ["/"], Counter[str]()
+            seen = set(ahead)
+            while ahead and time.monotonic() < until:
+                answer = http.get(ahead.pop(0))
+                read += 1
+                for link in re.findall(r'(?:href|src)="(/[^"#]*)"', answer.text):
+                    kind = re.sub(r"[A-Z]{2}[0-9]{2}|[0-9]+", "#", link.split("?")[0])
+                    alike[kind] += link not in seen
+                    if link not in seen and alike[kind] <= MOST_ALIKE:
+                        seen.add(link)
+                        ahead.append(link.replace("&amp;", "&"))
+    return read
+
+
+def measure_pages(folder: Path) -> None:
+    """Print and record the service's memory before, during and after reading a store's pages."""
+    store = Store(folder.resolve(), None)
+    with Process(store, module="service", HELIOTWIN_JOB_WORKERS="1") as service:
+        time.sleep(5)
+        found = {"after a start": _status_mb(service.number, "VmRSS")}
+        with MemoryWatch(service.number) as memory, ThreadPoolExecutor(READERS) as pool:
+            read = sum(pool.map(read_pages, [service.base] * READERS))
+        found["highest in two minutes of pages"] = memory.service
+        found["at their end"] = _status_mb(service.number, "VmRSS")
+        time.sleep(LATER_S)
+        found["a minute later"] = _status_mb(service.number, "VmRSS")
+    print(f"{read} pages", found)
+    for row, value in found.items():
+        title = "Memory of the service while the pages of the demonstration are read"
+        log_row(title, row, {"service [MB]": value}, n=read, of="pages")
 
 
 PHOTOGRAPHED = {"AA39": "AA39", "AC43": "AC43"} | {f"H{n:05d}": "AA39" for n in range(4)}
@@ -494,7 +546,18 @@ def main(arguments: list[str]) -> None:
         help="send the inputs whose names have one of these words",
     )
     parser.add_argument("--heliostats", type=int, default=20_000)
+    parser.add_argument("--pages", type=Path, help="read this store's pages", metavar="STORE")
     options = parser.parse_args(arguments)
+    if options.pages is not None:
+        with recording("memory-pages"):
+            measure_pages(options.pages)
+        return
+    with recording("-".join(["memory", *" ".join(options.only).split()])):
+        measure_inputs(parser, options)
+
+
+def measure_inputs(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Send the chosen inputs."""
     if not data_folder().is_dir():
         parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
     highest = 0.0
@@ -554,5 +617,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    with recording("memory"):
-        main(sys.argv[1:])
+    main(sys.argv[1:])

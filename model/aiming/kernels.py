@@ -11,6 +11,7 @@ two aims, some hundredths of a radian, which changes the image far less than its
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
+from torch.utils.checkpoint import checkpoint
 
 from model.errors import InvalidInputError, ModelError, UnreachableError
 from model.fleet import Superposition, Tile, in_parts
@@ -39,13 +41,16 @@ _CONE_SHARE, _DEVIATIONS = 0.98, 3.0
 
 _PADDING = 0.1
 
-MAX_PAIRS = 50_000_000
+MAX_PAIRS = 44_000_000
 """Heliostats times pixels of a plan: each pair that has light takes 16 bytes."""
 
 LARGE_PAIRS = 8_000_000
 """Pairs above which a machine should make one plan at a time."""
 
-_PART = 2**21
+_SAVED = 2**23
+"""Pairs above which intermediate values are computed again for gradients."""
+
+_PART = 2**20
 """Pairs of mirrors and pixels that are computed at once."""
 
 
@@ -107,12 +112,20 @@ class MirrorImages:
         return len(self.names)
 
     @classmethod
-    def join(cls, parts: Sequence["MirrorImages"]) -> "MirrorImages":
-        """The images of several tiles."""
-        names = tuple(name for part in parts for name in part.names)
-        return cls(
-            names, *(torch.cat([getattr(part, one) for part in parts]) for one in _OF_MIRRORS)
-        )
+    def join(cls, parts: Iterable["MirrorImages"], most: int) -> "MirrorImages | None":
+        """The images of several tiles, copied one after another; None without any.
+
+        ``most`` is the largest number of mirrors that they can have together.
+        """
+        names, whole = list[str](), dict[str, Tensor]()
+        for part in parts:
+            rows = slice(len(names), len(names) + len(part))
+            for name in _OF_MIRRORS:
+                of_part = getattr(part, name)
+                whole.setdefault(name, of_part.new_empty(most, *of_part.shape[1:]))[rows] = of_part
+            names += part.names
+        kept = {name: tensor[: len(names)] for name, tensor in whole.items()}
+        return cls(tuple(names), **kept) if names else None
 
     def on_map(self, receiver: Receiver, resolution: tuple[int, int]) -> "Kernels":
         """Find the pixels of a receiver's map of (rows, columns) that each mirror can light."""
@@ -162,8 +175,13 @@ class Kernels(MirrorImages):
         ``weights`` (N,) are 0 for mirrors that are not active. Differentiable.
         """
         total = moved.new_zeros(len(self.areas))
+        is_saved = self.pixels.numel() <= _SAVED or not moved.requires_grad
         for part, rows in self.parts():
-            values = part.light(moved[rows], is_sharp=is_sharp)
+            light = partial(part.light, is_sharp=is_sharp)
+            if is_saved:
+                values = light(moved[rows])
+            else:
+                values = checkpoint(light, moved[rows], use_reentrant=False)
             if weights is not None:
                 values = values * weights[rows, None]
             total = total.index_add(0, part.pixels.flatten(), values.flatten())

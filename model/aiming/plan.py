@@ -179,6 +179,7 @@ def plan_aims(
     plan = replace(plan, moved=rough.moved, multipliers=rough.multipliers[thin.block])
     deviations, before = rough.deviations, math.inf
     second_order = _second_order(_on_blocks(plan, thin))
+    del rough, thin  # the memory of a quarter of the pixels
     for _ in range(_CORRECTIONS):
         ascent = _Ascent(plan, _STEP_FINE, between, deviations, second_order)
         ascent.run(_N_FINE * min(_ease(kernels), _MOST_FINE), _UPDATE_FINE)
@@ -357,22 +358,27 @@ class LinearDraws(NamedTuple):
 
 def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:
     """Draw the errors of `AimPlan.draws`, with flux that changes in proportion to them."""
-    kernels, flux = plan.kernels, plan.flux
-    errors = _errors(kernels, count, 0)
-    variance, ratios = [], torch.full((count,), -math.inf)
-    bands = math.ceil(len(kernels) * len(flux) / _DENSE)
-    for band in torch.arange(len(flux)).chunk(bands):
-        some = kernels if len(band) == len(flux) else kernels.on_pixels(band)
-        drawn, of_band = torch.zeros(count, len(band)), torch.zeros(len(band))
-        for axis in range(2):
-            drawn += errors[:, :, axis] @ _changes(replace(plan, kernels=some), axis, of_band)
-        ratio = drawn.add_(flux[band]).div_(plan.limit[band]).max(dim=1).values
-        ratios = torch.maximum(ratios, ratio)
-        variance.append(of_band)
-    return LinearDraws(torch.cat(variance).sqrt(), ratios.double().numpy())
+    errors, pixels = _errors(plan.kernels, count, 0), torch.arange(len(plan.limit))
+    pairs = len(plan.kernels) * len(pixels)
+    bands = pixels.chunk(1 if pairs <= 2 * _DENSE else math.ceil(pairs / _DENSE))
+    found = [_draws_on(plan, band, errors) for band in bands]
+    sigma = torch.cat([one.sigma for one in found])
+    return LinearDraws(sigma, np.max([one.ratios for one in found], axis=0))
 
 
-_DENSE = 2**25
+def _draws_on(plan: AimPlan, band: Tensor, errors: Tensor) -> LinearDraws:
+    """Draws of errors (D, N, 2) on some pixels of the map."""
+    limit = plan.limit[band]
+    if len(band) < len(plan.limit):
+        plan = replace(plan, kernels=plan.kernels.on_pixels(band))
+    drawn, variance = torch.zeros(len(errors), len(band)), torch.zeros(len(band))
+    for axis in range(2):
+        drawn += errors[:, :, axis] @ _changes(plan, axis, variance)
+    ratios = drawn.add_(plan.flux).div_(limit).max(dim=1).values
+    return LinearDraws(variance.sqrt(), ratios.double().numpy())
+
+
+_DENSE = 2**23
 """Mirrors times pixels of a map whose changes are in memory at once."""
 
 

@@ -88,7 +88,7 @@ class _Hankel(NamedTuple):
     kernel: Tensor
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=2)  # 19 or 38 MB each
 def _hankel(edges: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> _Hankel:
     angles, weights = _quadrature(edges)
     frequency = FREQUENCY_STEP * torch.arange(FREQUENCY_COUNT, dtype=torch.float64)

@@ -3,11 +3,16 @@
 import ctypes
 import os
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # From glibc's `malloc.h`: the number of arenas that threads share.
 _M_ARENA_MAX = -8
 
 _ARENAS = 2
+
+_RETURN_EVERY_S = 20.0
 
 _libc = ctypes.CDLL(None) if sys.platform.startswith("linux") else None
 
@@ -32,3 +37,21 @@ def return_memory() -> None:
     trim = getattr(_libc, "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+@contextmanager
+def returning_memory() -> Iterator[None]:
+    """Call `return_memory` from time to time while the block runs."""
+    ended = threading.Event()
+
+    def work() -> None:
+        while not ended.wait(_RETURN_EVERY_S):
+            return_memory()
+
+    thread = threading.Thread(target=work, name="return-memory", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

@@ -3,7 +3,7 @@
 import csv
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -164,20 +164,22 @@ def trace_kernels(
     """
     lit = light_field(plant, request, ROWS, in_front=True)
     require_few_pairs(len(lit.aimed.setups), lit.task.resolution)
-    goal, skipped, parts = lit.task.receiver.aim, dict[str, str](), list[MirrorImages]()
+    goal, skipped = lit.task.receiver.aim, dict[str, str]()
     setups = sorted(lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, goal))
     if rng is not None and request.surfaces is not None:
         setups = [_drawn(setup, request.surfaces, rng) for setup in setups]
-    for tile in tiles(setups, lit.neighbours):
-        found = ImageTracer(lit.task)(tile)
-        skipped |= found.skipped
-        parts += found.images
-        step(f"images of {len(tile)} heliostats")
-    if not parts:
+
+    def traced() -> Iterator[MirrorImages]:
+        for tile in tiles(setups, lit.neighbours):
+            found = ImageTracer(lit.task)(tile)
+            skipped.update(found.skipped)
+            yield from found.images
+            step(f"images of {len(tile)} heliostats")
+
+    images = MirrorImages.join(traced(), len(setups))
+    if images is None:
         reason = next(iter(skipped.values()), "the layout gives it none")
         raise InvalidInputError(f"no heliostat sends light to {request.receiver}: {reason}")
-    images = MirrorImages.join(parts)
-    parts.clear()
     return_memory()
     kernels = images.on_map(lit.task.receiver, lit.task.resolution)
     return TracedKernels(kernels, lit.task, skipped)

@@ -375,7 +375,7 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         workers = Workers(runtime, kinds, settings.job_workers, on_stuck)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        with serve_metrics(settings, PROCESS):
+        with serve_metrics(settings, PROCESS), memory.returning_memory():
             workers.start()
             stopping.wait()
             workers.stop()

@@ -71,7 +71,8 @@ def serve(settings: Settings, on_listening: Callable[[], None] = lambda: None) -
     config = config_of(settings, app)
     server = _Server(config, app.state.stopping, on_listening)
     try:
-        server.run()
+        with memory.returning_memory():
+            server.run()
     except SystemExit as refusal:  # uvicorn exits this way if the application or the port failed
         raise NotStartedError("the service could not start; the log above says why") from refusal
 

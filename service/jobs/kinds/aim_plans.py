@@ -40,6 +40,7 @@ from service.base.fields import (
     SunAt,
     parse_moment,
 )
+from service.base.memory import return_memory
 from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.field_forecasts import Fleet, FleetForecastIn, expected_s
@@ -405,6 +406,7 @@ class _Planner:
             single = forecast_group(
                 runtime, middle, resolution, neighbours, _unreported(self.context)
             )
+            return_memory()
             require_some(single.heliostats, single.skipped)
             return TracedImages(kernels, single, group.skipped, frozenset(group.without_surface))
 

@@ -181,17 +181,21 @@ def trace_kernels(
     field = _seen_neighbours(runtime, fleet, report, _NEIGHBOURS_SHARE) if neighbours else None
     count = math.ceil(len(fleet.names) / TILE)
     traced = _Counted(report, "images of mirrors", count, _NEIGHBOURS_SHARE, 0.5)
-    engine, found = engine_of(runtime), list[MirrorImages]()
-    task = _task(fleet, resolution, neighbours, engine, lambda: traced(len(found)))
-    for tile in engine.map(ImageTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
-        fleet.skipped.update(tile.skipped)
-        found += tile.images
-        traced(len(found))
-    if not found:
+    engine, n_done = engine_of(runtime), 0
+    task = _task(fleet, resolution, neighbours, engine, lambda: traced(n_done))
+
+    def tiles() -> Iterator[MirrorImages]:
+        nonlocal n_done
+        for tile in engine.map(ImageTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
+            fleet.skipped.update(tile.skipped)
+            n_done += 1
+            traced(n_done)
+            yield from tile.images
+
+    images = MirrorImages.join(tiles(), len(fleet.names))
+    if images is None:
         name, reason = next(iter(fleet.skipped.items()), ("the store", "it holds no heliostat"))
         raise ConflictError(f"no heliostat reaches {fleet.receiver.name}; {name}: {reason}")
-    images = MirrorImages.join(found)
-    found.clear()
     return_memory()
     return images.on_map(fleet.receiver, resolution)
 

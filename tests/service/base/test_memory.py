@@ -44,7 +44,40 @@ def heaps(*arguments: str, **more: str) -> tuple[int, str]:
     return len(ElementTree.fromstring(done.stdout).findall("heap")), done.stderr.strip()
 
 
-@pytest.mark.skipif("glibc" not in platform.libc_ver(), reason="only glibc has these heaps")
+RETURNED = """
+import os, time
+from pathlib import Path
+from service.base import memory
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+memory.limit_memory()
+blocks = [bytes(60_000) for _ in range(2_000)]
+highest = resident()
+del blocks[:-1]  # the last one keeps the heap as large as it is
+print(highest - resident())
+memory._RETURN_EVERY_S = 0.01
+with memory.returning_memory():
+    while highest - resident() < 100e6:
+        time.sleep(0.01)
+print(highest - resident())
+"""
+
+only_glibc = pytest.mark.skipif(
+    "glibc" not in platform.libc_ver(), reason="only glibc has these heaps"
+)
+
+
+@only_glibc
+def test_freed_memory_is_returned():
+    """Most of 120 MB, which glibc keeps without that."""
+    done = subprocess.run(
+        [sys.executable, "-c", RETURNED], capture_output=True, text=True, check=True, timeout=300
+    )
+    kept, returned = map(int, done.stdout.split())
+    assert kept < 20e6 < 100e6 <= returned
+
+
+@only_glibc
 def test_threads_share_two_heaps_unless_the_environment_says_otherwise():
     assert heaps()[0] > 2
     assert heaps("limit") == (2, "True")

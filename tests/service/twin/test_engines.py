@@ -70,9 +70,13 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
 def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
     task = ImageTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
     images, expected = (
-        MirrorImages.join([one for tile in engine.map(task, some_tiles()) for one in tile.images])
+        MirrorImages.join(
+            (one for tile in engine.map(task, some_tiles()) for one in tile.images), 32
+        )
         for engine in (Ray("local"), Threads(1))
     )
+    assert images is not None
+    assert expected is not None
     assert images.names == expected.names
     assert len(images) == 32
     for name in ("expected", "sharp", "sides", "spread", "aims", "axes"):

@@ -54,8 +54,13 @@ def planned(client: TestClient, **changes: Any) -> dict[str, Any]:
     return real.done_job(client, "/v1/jobs/aim-plans", **BODY | changes)
 
 
-def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient):
-    job = planned(plant)
+@pytest.fixture(scope="module")
+def job(plant: TestClient) -> dict[str, Any]:
+    """A plan of all heliostats for one sun."""
+    return planned(plant)
+
+
+def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient, job: dict[str, Any]):
     result = job["result"]
     assert result["peak_p95_w_m2"] <= 1.002 * 80e3
     assert result["power_w"] > result["baseline"]["power_w"]
@@ -70,8 +75,9 @@ def test_plan_keeps_the_limit_and_its_aims_do_what_it_says(plant: TestClient):
     assert forecast["peak_w_m2"] == pytest.approx(result["peak_w_m2"], rel=0.03)
 
 
-def test_page_shows_the_plan_and_gives_its_aims(plant: TestClient, tmp_path: Path):
-    job = planned(plant)
+def test_page_shows_the_plan_and_gives_its_aims(
+    plant: TestClient, job: dict[str, Any], tmp_path: Path
+):
     page = Page(plant.get(f"/jobs/{job['id']}", headers={"Accept": "text/html"}).text)
     for words in ("Most that any aims can give", "Peak in 95 % of draws", "not active", "Flux"):
         assert words in page.words
@@ -83,8 +89,8 @@ def test_page_shows_the_plan_and_gives_its_aims(plant: TestClient, tmp_path: Pat
 
 
 @pytest.mark.full
-def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient):
-    first = planned(plant)["result"]
+def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient, job: dict[str, Any]):
+    first = job["result"]
     again = planned(plant, aim_points_m=first["aim_points_m"])["result"]
     assert again["power_w"] > 0.995 * first["power_w"]
     assert again["peak_p95_w_m2"] <= 1.002 * 80e3
