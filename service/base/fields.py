@@ -401,7 +401,7 @@ class FittedParameter(ReportPart):
     value: Any = Field(description="A number, or numbers by heliostat.")
     ci95: Any = Field(default=None, description="Its 95 % interval, or intervals by heliostat.")
     unit: str = Field(default="", description="Unit of value, interval and values by day.")
-    by_day: dict[str, float] = Field(default={}, description="Values by day, if they differ.")
+    by_day: dict[str, float] = Field(default={}, description="Values by day [`unit`].")
 
 
 class FoundEffect(ReportPart):
@@ -423,7 +423,7 @@ class TriedEffect(ReportPart):
 
     name: str = Field(description="Its name in the catalogue.")
     accuracy_after: float | None = Field(default=None, description="With it alone [1].")
-    score: float | None = Field(default=None, description="By which candidates are ranked.")
+    score: float | None = Field(default=None, description="By which candidates are ranked [1].")
     accuracy_gain: MeanGain | None = Field(default=None, description="Its gain in accuracy.")
 
 

@@ -62,6 +62,7 @@ WITHOUT_UNIT = {
     "gear",
     "intercept",
     "mahalanobis_distance",
+    "mean",
     "misfit",
     "noise_floor",
     "optical_efficiency",
@@ -70,7 +71,10 @@ WITHOUT_UNIT = {
     "reference_sine",
     "reflectance",
     "shading",
+    "score",
     "unexplained_share",
+    # Values of an effect's parameter, whose unit is the field beside it (DESIGN.md, section 7).
+    "by_day",
     # Of cameras: matrices, and coefficients of a lens.
     "distortion",
     "homography",
