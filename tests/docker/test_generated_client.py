@@ -218,7 +218,7 @@ def test_every_request_of_the_guide_in_its_order(generated: dict[str, Any], tmp_
             name, answer = plant.follow(call)
             assert answer.status_code in (HTTPStatus.OK, HTTPStatus.CREATED, HTTPStatus.ACCEPTED), (
                 call,
-                answer,
+                answer.content.decode(errors="replace"),
             )
             parsed[name] = answer.parsed
             if name == "post_predictions_job":

@@ -196,7 +196,7 @@ def test_what_listens_says_where_and_answers(tmp_path: Path):
 def test_the_last_line_of_the_demonstration_starts_the_service(tmp_path: Path):
     """As it is printed, whatever the folder is called."""
     printed = StringIO()
-    demo._print(Console(file=printed, width=40), [], tmp_path, tmp_path / "a store's folder")
+    demo._print(Console(file=printed, width=40), [], None, tmp_path, tmp_path / "a store's folder")
     line, port = printed.getvalue().splitlines()[-1], free_port()
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = ["bash", "-c", f"exec env {line} --port {port} --json"]

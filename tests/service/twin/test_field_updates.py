@@ -17,7 +17,6 @@ from service.store import acknowledgements, field_state
 from service.store.columns import now
 from service.store.job_tables import AlarmRow
 from service.store.tables import HeliostatRow, HeliostatStateRow
-from service.twin.alarms import field_updates
 from service.twin.alarms.field_updates import FieldStateWriter
 from service.twin.runtime.runtime import Runtime
 from service.web.app import create_app
@@ -172,17 +171,17 @@ def test_worker_that_read_before_another_wrote_writes_nothing(
     stale: Runtime, monkeypatch: pytest.MonkeyPatch
 ):
     slow, quick = FieldStateWriter(stale), FieldStateWriter(stale)
-    write = field_updates._write
+    read = slow._read
 
-    def write_late(*arguments: Any) -> None:
+    def read_early() -> Any:
         """The other worker sees that a photograph ended the alarm."""
-        monkeypatch.setattr(field_updates, "_write", write)
+        reading = read()
         with stale.database.writing() as session:
             session.execute(update(HeliostatRow).values(created_at=now()))
         quick.update()
-        write(*arguments)
+        return reading
 
-    monkeypatch.setattr(field_updates, "_write", write_late)
+    monkeypatch.setattr(slow, "_read", read_early)
     slow.update()
     with stale.database.reading() as session:
         assert acknowledgements.open_alarms(session) == []

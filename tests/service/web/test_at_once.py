@@ -12,8 +12,9 @@ import psycopg
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from sqlalchemy import URL
+from sqlalchemy import URL, text
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import NotFoundError
@@ -98,36 +99,39 @@ def test_heliostat_that_is_posted_twice_at_once_is_never_overwritten(
     assert sorted(answer.status_code for answer in again) == [200, 201]
 
 
+@pytest.mark.parametrize(
+    "store_url", [pytest.param("postgres", marks=pytest.mark.postgres)], indirect=True
+)
 def test_transaction_is_retried_after_a_deadlock(database: Database):
-    """Two that take two rows in opposite orders: on PostgreSQL one is ended, and does
-    not know it.
-    """
+    """A change and an import take two rows in opposite orders: PostgreSQL ends the change."""
+    barrier, tried = threading.Barrier(2), list[str]()
+
+    def add(session: Session, name: str) -> None:
+        session.query(HeliostatRow).filter_by(name=name).with_for_update().one().east_m += 1
+        session.flush()
+
+    def change(session: Session) -> None:
+        tried.append("change")
+        session.execute(text("SET LOCAL deadlock_timeout = '100ms'"))
+        add(session, "A")
+        if len(tried) == 1:
+            barrier.wait(WAIT_LIMIT_S)
+        add(session, "B")
+
+    def bring_in() -> None:
+        with database.writing() as session:
+            session.execute(text("SET LOCAL deadlock_timeout = '5min'"))
+            add(session, "B")
+            barrier.wait(WAIT_LIMIT_S)
+            add(session, "A")
+
     with database.writing() as session:
         for name in ("A", "B"):
             store.put_heliostat(session, name, {}, (0, 0, 0))
-    barrier = threading.Barrier(2)
-
-    def add(first: str, second: str) -> None:
-        def call(session: Any) -> None:
-            for place, name in enumerate((first, second)):
-                session.query(HeliostatRow).filter_by(name=name).with_for_update().one().east_m += 1
-                session.flush()
-                if (
-                    place == 0
-                    and database.url.get_backend_name() == "postgresql"
-                    and not barrier.broken
-                ):
-                    try:
-                        barrier.wait(WAIT_LIMIT_S)  # both hold their first row now
-                    except threading.BrokenBarrierError:
-                        continue
-                    barrier.abort()
-
-        database.run_in_transaction(call)
-
-    at_once(lambda: add("A", "B"), lambda: add("B", "A"))
+    at_once(lambda: database.run_in_transaction(change), bring_in)
     with database.reading() as session:
-        assert [store.get_heliostat(session, name).east_m for name in ("A", "B")] == [2, 2]
+        east = [store.get_heliostat(session, name).east_m for name in ("A", "B")]
+    assert (tried, east) == (["change", "change"], [2, 2])
 
 
 def test_deadlock_is_not_reported_as_unavailable_database():
