@@ -48,6 +48,7 @@ def test_every_public_name_is_there():
         _ = heliotwin.open_plants
 
 
+@pytest.mark.full
 def test_a_plant_has_its_names(plant):
     assert plant.heliostats == ("AB12", "AC31", "AF27", "AK08")
     assert plant.targets == ("calibration_target",)
@@ -119,6 +120,7 @@ def test_a_prediction_is_the_commands(plant, single_plant, tmp_path):
     assert found.misfit == pytest.approx(entry["misfit"], abs=1e-4)
 
 
+@pytest.mark.full
 def test_named_photographs_are_held_out_or_not(plant):
     found = plant.predict("AB12", images=["101", "103"])
     assert found.images == ("101", "103")

@@ -249,6 +249,7 @@ def test_nothing_comes_or_goes_in_calm_photographs():
     assert calm["effects"] == []
 
 
+@pytest.mark.full
 def test_recanted_mirror_is_found_with_its_date():
     report = study_to_json(found_in([CANTED], "facet_canting", "slope_error"))
     (found,) = report["effects"]

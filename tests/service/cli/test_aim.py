@@ -101,6 +101,7 @@ def test_plans_begin_with_aims_of_a_moment_before(plant: Path, tmp_path: Path):
     assert again["peak_p95_w_m2"] <= 1.002 * 900e3
 
 
+@pytest.mark.full
 def test_mirrors_are_defocused_where_no_aims_help(plant: Path, tmp_path: Path):
     report = aimed(plant, tmp_path, "strip", 200)  # 1.8 MW at most, of 2.6 MW
     assert report["inactive"]

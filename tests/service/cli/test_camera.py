@@ -39,6 +39,7 @@ def test_srgb_stays_where_it_is_no_worse(pair_plant, tmp_path):
     assert len(report["per_image"]) == report["photographs"] == report["days"] == 8
 
 
+@pytest.mark.full
 def test_another_camera_s_curve_is_found_and_makes_forecasts_agree(pair_plant, tmp_path):
     root = taken_through(Power(1.4), pair_plant, tmp_path / "plant")
     report = measure_camera(

@@ -143,6 +143,7 @@ def test_an_interrupted_prediction_leaves_what_was_done(
     assert report["skipped"] == dict.fromkeys(others, "interrupted")
 
 
+@pytest.mark.full
 def test_more_workers_than_the_connections_allow_are_one_line(tmp_path: Path):
     """The option counts like the setting; both databases have their pool of these connections."""
     few = {"HELIOTWIN_DATABASE_CONNECTIONS": "12"}
@@ -221,6 +222,7 @@ def _predict_for_hours(begun: str, *arguments: str) -> None:
     main()
 
 
+@pytest.mark.full
 def test_an_interrupted_verb_ends_by_130(made_plant: Path, tmp_path: Path):
     """Ctrl-C: the exit code that a shell expects of an interrupted program, and no traceback."""
     begun, errors, out = (tmp_path / name for name in ("begun", "stderr", "out"))

@@ -96,6 +96,7 @@ def test_plan_begins_with_aims_of_a_moment_before(plant: TestClient, job: dict[s
     assert again["peak_p95_w_m2"] <= 1.002 * 80e3
 
 
+@pytest.mark.full
 def test_a_heliostat_in_the_towers_shadow_does_not_spoil_the_plan(tmp_path: Path):
     file = write_aim_plant(tmp_path / "plant")
     with file.open("a") as plant:
@@ -112,6 +113,7 @@ def test_a_heliostat_in_the_towers_shadow_does_not_spoil_the_plan(tmp_path: Path
     assert result["power_w"] <= result["bound_w"]
 
 
+@pytest.mark.full
 def test_limit_over_the_map(plant: TestClient):
     result = planned(plant, limit_w_m2=[[200e3, 200e3], [70e3, 70e3]])["result"]
     assert result["limit_w_m2"] == pytest.approx(200e3)

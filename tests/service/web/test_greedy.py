@@ -256,6 +256,7 @@ def test_server_bounds_connections_and_heads():
     assert config.http.max_each == settings.max_connections_each
 
 
+@pytest.mark.full
 def test_half_a_head_is_not_waited_for_for_ever(app: FastAPI):
     class Hasty(Protocol):
         head_s = 0.2

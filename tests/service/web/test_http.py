@@ -170,6 +170,7 @@ def filled(client: TestClient, post: Post) -> TestClient:
     return client
 
 
+@pytest.mark.full
 def test_head_answers_as_get_without_its_body(filled: TestClient):
     differ = ("x-request-id", "date")
     asked = 0

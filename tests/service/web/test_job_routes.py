@@ -163,6 +163,7 @@ def test_surface_of_a_late_worker_is_not_stored(
     assert client.get("/v1/heliostats/AA39/surfaces").json()["items"] == []
 
 
+@pytest.mark.full
 def test_predictions_without_any_image_fail_with_the_reason(client: TestClient):
     job = finish(client, client.post("/v1/jobs/predictions", json={"heliostats": ["AA39"]}))
     assert job["state"] == "failed"
@@ -807,6 +808,7 @@ def test_watchers_have_a_bound_together_and_for_each_key(app: FastAPI, settings:
         until(is_free)  # a place is given back with its connection
 
 
+@pytest.mark.full
 def test_many_watchers_are_one_look_at_the_database(app: FastAPI, server: str):
     (number,) = large(app)
     with following(server, number, 12) as streams:

@@ -74,6 +74,7 @@ PATHS = (
 )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("path", PATHS)
 def test_page_does_not_grow_with_the_field(large: TestClient, path: str):
     page = text_of(large, path)

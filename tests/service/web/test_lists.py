@@ -84,6 +84,7 @@ def test_lists_that_are_pages_have_no_more_than_a_page(real_client: TestClient):
 # -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_unknown_query_parameters_are_refused_on_every_path(refusing: TestClient):
     """By name and with those that are known; a `GET` of every path of the document."""
     paths = refusing.get("/openapi.json").json()["paths"]

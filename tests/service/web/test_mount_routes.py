@@ -142,6 +142,7 @@ def test_the_past_is_turned_by_the_drives_of_then(
         np.testing.assert_allclose(attitude, goal, atol=1e-5)
 
 
+@pytest.mark.full
 def test_some_are_calibrated_by_the_prior_of_all(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):

@@ -178,6 +178,7 @@ def test_surface_made_from_all_photographs_is_not_yet_evaluated(pages: TestClien
     )
 
 
+@pytest.mark.full
 def test_colours_mean_the_same_in_every_field(tmp_path: Path):
     """What is fine recedes, also the worst heliostat of the field; the ends are settings."""
     colours = {}

@@ -59,6 +59,7 @@ def test_times_are_previewed_stored_and_undone(client: TestClient, taken: list[d
     assert history[-1]["after"] == {"taken_at": None}
 
 
+@pytest.mark.full
 def test_an_undone_change_stays_so_while_alarms_are_undone(
     client: TestClient, taken: list[dict[str, Any]]
 ):

@@ -5,7 +5,10 @@ its light.
 import csv
 import io
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,6 +21,7 @@ from model.errors import InvalidInputError
 from model.imaging import MeasuredFlux, Quality
 from service import store
 from service.base.errors import BusyError
+from service.base.settings import Settings
 from service.sources.decode import decode_image
 from service.store.columns import now
 from service.store.database import Database
@@ -29,9 +33,19 @@ from service.store.photographs.groups import (
 )
 from service.store.tables import TargetRow
 from service.twin.runtime import runtime
+from service.web.app import create_app
 from service.web.pages import heliostat, photograph_list
 from tests.page import Page
-from tests.service.conftest import FakeOperations, Post, png, poster
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    Post,
+    client_of,
+    png,
+    poster,
+    properties_document,
+    tower_document,
+)
 from tests.service.web.pages import HTML, text_of
 
 HERE = "/heliostats/AA39/photographs"
@@ -52,20 +66,31 @@ def rows_of(page: Page) -> list[str]:
     return [name.removeprefix("AA39 ") for name in names_of(page)]
 
 
-@pytest.fixture
-def filled(client: TestClient, post: Post) -> TestClient:
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """Three photographs: one in three kinds, a refused one in two, and an excluded one."""
-    for seed, kind in enumerate(("raw", "cropped", "flux")):
-        assert post(png(seed + 1), id="1", kind=kind).status_code == 201
-    for seed, kind in enumerate(("cropped", "flux")):
-        assert post(png(seed + 11, refused=True), id="2", kind=kind).status_code == 201
-    assert post(png(21), id="3").status_code == 201
-    excluded = client.patch(
-        "/v1/heliostats/AA39/measurements/3", json={"excluded": True, "reason": "a bird"}
-    )
-    assert excluded.status_code == 200
-    client.headers.update(HTML)
-    return client
+    with filled_store(tmp_path_factory.mktemp("filled")) as client:
+        yield client
+
+
+@contextmanager
+def filled_store(folder: Path) -> Iterator[TestClient]:
+    settings = Settings(data_dir=folder, **QUIET)
+    with client_of(create_app(settings, FakeOperations())) as client:
+        client.put("/v1/plant", json=tower_document())
+        client.put("/v1/heliostats/AA39", json=properties_document())
+        post = poster(client)
+        for seed, kind in enumerate(("raw", "cropped", "flux")):
+            assert post(png(seed + 1), id="1", kind=kind).status_code == 201
+        for seed, kind in enumerate(("cropped", "flux")):
+            assert post(png(seed + 11, refused=True), id="2", kind=kind).status_code == 201
+        assert post(png(21), id="3").status_code == 201
+        excluded = client.patch(
+            "/v1/heliostats/AA39/measurements/3", json={"excluded": True, "reason": "a bird"}
+        )
+        assert excluded.status_code == 200
+        client.headers.update(HTML)
+        yield client
 
 
 def test_photograph_has_one_row(filled: TestClient):
@@ -95,16 +120,17 @@ def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pyte
     assert 'href="/photographs?heliostat=AA39">Newest' in page
 
 
-@pytest.fixture
-def field(filled: TestClient, properties: dict[str, Any]) -> TestClient:
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """The same with another heliostat's on another target, of a day long ago."""
-    assert filled.put("/v1/heliostats/AB01", json=properties).status_code == 201
-    send = poster(filled)
-    answer = send(
-        png(31), heliostat="AB01", id="4", target="upper", taken_at="2024-06-01T11:30:00Z"
-    )
-    assert answer.status_code == 201
-    return filled
+    with filled_store(tmp_path_factory.mktemp("field")) as client:
+        properties = properties_document()
+        assert client.put("/v1/heliostats/AB01", json=properties).status_code == 201
+        answer = poster(client)(
+            png(31), heliostat="AB01", id="4", target="upper", taken_at="2024-06-01T11:30:00Z"
+        )
+        assert answer.status_code == 201
+        yield client
 
 
 OF_FIELD = [

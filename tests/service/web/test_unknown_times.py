@@ -58,6 +58,7 @@ def imported(undated: Path, tmp_path: Path) -> Iterator[TestClient]:
         yield client
 
 
+@pytest.mark.full
 def test_an_import_without_times_invents_no_steps(imported: TestClient):
     """They had come two seconds apart, and their order was taken for that of years."""
     job = calibrate(imported)
