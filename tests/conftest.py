@@ -55,6 +55,7 @@ FULL = (
     "tests/heliotwin/test_networks.py",
     "tests/heliotwin/test_notebooks.py",
     "tests/service/browser/",
+    "tests/service/web/test_large_field.py",
     "tests/service/web/test_openapi_fuzz.py",
     "tests/test_additions.py",
     "tests/test_silence.py",

@@ -59,6 +59,7 @@ def test_a_plant_has_its_names(plant):
     assert photographs[0].centered.shape == (64, 64)
 
 
+@pytest.mark.full
 def test_surfaces_are_measured_ideal_or_given(plant, made_plant):
     measured, ideal = plant.surface("AB12"), plant.surface("AB12", "ideal")
     heights = np.full((4, 8, 8), 1e-3)
@@ -128,6 +129,7 @@ def test_named_photographs_are_held_out_or_not(plant):
     assert [one.is_held_out for one in compared] == [False, True, False, True]
 
 
+@pytest.mark.full
 def test_a_comparison_is_the_commands(plant, single_plant, tmp_path):
     out = written(tmp_path, "forecast", single_plant, "--surfaces", "measured")
     entries = json.loads((out / "forecast.json").read_text())["measurements"]
@@ -247,6 +249,7 @@ def refusals(plant: heliotwin.PlantFolder) -> dict[str, object]:
     }
 
 
+@pytest.mark.full
 def test_wrong_arguments_are_refused_by_name(plant):
     for says, call in refusals(plant).items():
         with pytest.raises(heliotwin.InvalidInputError, match=re.escape(says)):

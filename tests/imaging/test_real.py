@@ -20,6 +20,7 @@ def cases(stj, plant):
     return [read_case(path, plant) for path in paths]
 
 
+@pytest.mark.full
 def test_every_frame_is_measured(cases):
     assert sum(case.raw is not None for case in cases) >= 6
     for case in cases:
@@ -37,6 +38,7 @@ def test_the_goals_hold(cases):
     assert np.nanmedian([row["CoM raw"] for row in rows]) <= 0.10
 
 
+@pytest.mark.full
 def test_edges_of_a_sheet_agree_with_the_marks_on_it(cases, plant):
     """One target is a white sheet before the sky, of 6.05 x 6.89 m around its brackets.
 
@@ -68,6 +70,7 @@ def test_edges_of_a_sheet_agree_with_the_marks_on_it(cases, plant):
     assert apart_px < 3
 
 
+@pytest.mark.full
 def test_empty_targets_hold_no_spot(stj, plant):
     plane = plant.targets["solar_tower_juelich_lower"]
     paths = sorted((stj / "empty-targets").glob("*.png"))[::15]

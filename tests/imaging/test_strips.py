@@ -51,6 +51,7 @@ def test_conversion_may_have_other_axes_and_types():
     assert convert_by_strips(image[:, :, 0], lambda strip: strip / 2).dtype == np.float64
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["flux", "cropped", "raw"])
 def test_a_large_photograph_takes_little_more_than_its_light(kind):
     """16 bytes for each pixel; index arrays and colours in floating point took some 40."""

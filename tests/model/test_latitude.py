@@ -40,7 +40,7 @@ def situation(latitude: float) -> tuple[Heliostat, list[Observation], list[Obser
     return heliostat, [replace(o, sun=sun) for o, sun in zip(seen, recorded, strict=True)], seen
 
 
-@pytest.mark.parametrize("latitude", [37.0, -30.0])
+@pytest.mark.parametrize("latitude", [pytest.param(37.0, marks=pytest.mark.full), -30.0])
 def test_alignment_images_and_predictions_are_those_of_the_true_sun(latitude: float):
     heliostat, recorded, true = situation(latitude)
     right, z = PlantModel(Site(latitude, 0.0, 0.0)), default_prior().mean

@@ -179,6 +179,7 @@ def test_misfit_distinguishes_surfaces(heliostat, truth, refined):
     assert mean_misfit(heliostat, default_prior().mean, truth) > 1.5 * refined.misfit
 
 
+@pytest.mark.full
 def test_a_foreign_image_is_named(heliostat, truth):
     """On one of six images another heliostat's spot lies beside: the others still agree, and that
     one is found out.
@@ -235,6 +236,7 @@ def test_no_image_is_named(heliostat):
 QUICK = RefinementOptions(annealing=(0.5,), rounds=1, max_steps=2, samples=8)
 
 
+@pytest.mark.full
 def test_progress_of_a_refinement_is_counted_to_its_end(heliostat, truth):
     """A job's page showed 0 % for its minute."""
     reports: list[tuple[str, int, int]] = []

@@ -283,6 +283,7 @@ def test_hazy_days_are_found_and_named():
         assert by_day[day.isoformat()] == pytest.approx(truth["circumsolar_ratio"], abs=0.03)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_dated", [True, False])
 def test_a_rough_mirror_is_found_by_name(is_dated: bool):
     taken = photographs([ROUGH])

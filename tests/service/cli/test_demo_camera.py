@@ -18,6 +18,7 @@ def spot(plane):
     return gaussian(plane, 0.3, -0.2, 0.8, 0.5, 0.6)
 
 
+@pytest.mark.full
 def test_a_frame_depends_on_its_generator_alone(plane, spot):
     frames = [photograph(spot, plane, np.random.default_rng(seed)) for seed in (1, 1, 2)]
     assert frames[0].shape == (1080, 1440, 3)

@@ -68,6 +68,7 @@ def test_folder_and_store_are_one_plant(pair_plant: Path, stored: Runtime, tmp_p
         assert {one.identifier for one in row.measurements} == set(predicted[name]["images"])
 
 
+@pytest.mark.full
 def test_an_image_that_two_measurements_have_counts_once(pair_plant: Path, tmp_path: Path):
     root = tmp_path / "plant"
     shutil.copytree(pair_plant, root)

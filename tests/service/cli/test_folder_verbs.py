@@ -166,6 +166,7 @@ def test_heliostats_without_a_surface_are_forecast_as_ideal_mirrors(pair_plant, 
     assert "1 of 2 heliostats have no surface" in by_sun["warnings"][0]
 
 
+@pytest.mark.full
 def test_a_surface_that_cannot_be_read_is_no_missing_one(pair_plant, tmp_path):
     root = tmp_path / "plant"
     shutil.copytree(pair_plant, root)
@@ -178,6 +179,7 @@ def test_a_surface_that_cannot_be_read_is_no_missing_one(pair_plant, tmp_path):
 SHOULDER = {"name": "camera_shoulder", "parameters": {"compression": 2.0}}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "effects", [[], [SHOULDER], [{"name": "sun_shape", "parameters": {"circumsolar_ratio": 0.4}}]]
 )

@@ -68,7 +68,10 @@ def test_mistake_ends_with_its_line(tmp_path: Path):
     ends(heliotwin("plant", "check", tmp_path / "none.yaml"), 2, "no such file")
 
 
-@pytest.mark.parametrize("make", [write_plant, gemasolar, ps10])
+@pytest.mark.parametrize(
+    "make",
+    [ps10, *(pytest.param(make, marks=pytest.mark.full) for make in (write_plant, gemasolar))],
+)
 def test_plant_is_drawn(tmp_path: Path, make: Any):
     out = tmp_path / "pictures" / "plant.png"
     done = heliotwin("plant", "show", make(tmp_path), "--out", out)

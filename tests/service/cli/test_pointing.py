@@ -40,6 +40,7 @@ from tests.service.conftest import QUIET, properties_document, tower_document
 from tests.service.spots import photographs
 
 
+@pytest.mark.full
 def test_the_demonstrations_motors_tell_where_its_mirrors_point(pair_plant: Path, tmp_path: Path):
     runtime = Runtime.from_settings(Settings(data_dir=tmp_path, **QUIET))
     runtime.database.upgrade()

@@ -325,6 +325,7 @@ def test_job_reports_phase_counts_and_remaining_time(runtime: Runtime):
     assert look(runtime, number).remaining_s is None
 
 
+@pytest.mark.full
 def test_prediction_reports_its_phases_and_an_estimate_from_the_beginning(
     real_client: TestClient, monkeypatch: pytest.MonkeyPatch
 ):

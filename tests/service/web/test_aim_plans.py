@@ -135,6 +135,7 @@ DAY = {
 }
 
 
+@pytest.mark.full
 def test_day_is_planned_step_by_step(plant: TestClient):
     """At 5 o'clock in Madrid the sun is below the horizon; each step keeps the limit."""
     job = real.done_job(plant, "/v1/jobs/aim-plans", **DAY)

@@ -315,6 +315,7 @@ def test_camera_that_a_study_found_changed_until_that_is_adopted(app: FastAPI, c
     assert items(client) == []
 
 
+@pytest.mark.full
 def test_clock_that_went_wrong_until_it_is_calibrated_without(calibrating: TestClient):
     client, post, names = calibrating, poster(calibrating), ("AA39", "AB01", "AB02")
     wrong = photographs(tower_document(), properties_document(), fast_minutes=2.0)

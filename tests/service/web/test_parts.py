@@ -178,6 +178,7 @@ def test_parts_need_what_their_page_needs(shown: TestClient):
     assert shown.get("/v1/heliostats?table=x").status_code == 422  # which only pages take
 
 
+@pytest.mark.full
 def test_plan_as_tables_maps_and_timelines(app: FastAPI, two_heliostats: TestClient):
     job = planned(app, two_heliostats)
     rows = sheet(two_heliostats, f"/plans/{job['id']}?table=series")

@@ -119,6 +119,7 @@ def test_move_since_the_calibration_is_reported_with_its_dates(
     )
 
 
+@pytest.mark.full
 def test_photographs_without_a_time_say_of_no_move(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):

@@ -118,6 +118,7 @@ def filled(services: list[TestClient]) -> list[TestClient]:
     return services
 
 
+@pytest.mark.full
 def test_crossing_changes_of_many_photographs_all_succeed(filled: list[TestClient]):
     calls = [
         partial(_give_times, filled[turn % 2], ["AA39", "AB01"][:: (-1) ** turn], turn, f"{turn}")
