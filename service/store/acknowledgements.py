@@ -1,8 +1,7 @@
 """Storage of acknowledged alarms, and of the history of alarms."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -25,26 +24,12 @@ class Key(NamedTuple):
     fingerprint: str
 
 
-@dataclass(frozen=True)
-class AcknowledgementBatch:
-    """Alarms that were acknowledged together, with the number of those of each reason."""
-
-    id: int
-    created_at: datetime
-    created_by: str
-    comment: str
-    undone_at: datetime | None
-    undone_by: str | None
-    reasons: Mapping[str, int]
-
-
-@dataclass(frozen=True)
-class AlarmHistory:
-    """An alarm from its beginning to its end, with its acknowledgements, oldest first."""
+class StoredAlarm(NamedTuple):
+    """An alarm with its heliostat's name and, in its history, acknowledgements, oldest first."""
 
     heliostat: str | None
     row: AlarmRow
-    acknowledgements: tuple[AcknowledgementRow, ...]
+    acknowledgements: Sequence[AcknowledgementRow] = ()
 
 
 def acknowledged(session: Session) -> dict[Key, AcknowledgementRow]:
@@ -142,7 +127,7 @@ def undo(session: Session, batch: int, actor: str) -> list[Key]:
 
 def list_batches(
     session: Session, limit: int, after: int | None = None, number: int | None = None
-) -> list[AcknowledgementBatch]:
+) -> list[list[AcknowledgementRow]]:
     """Up to ``limit`` batches older than ``after``, newest first, or only batch ``number``."""
     column = AcknowledgementRow.batch
     chosen = select(column).where(column.is_not(None)).distinct().order_by(column.desc())
@@ -154,45 +139,25 @@ def list_batches(
     rows: dict[int | None, list[AcknowledgementRow]] = defaultdict(list)
     for row in session.scalars(select(AcknowledgementRow).where(column.in_(numbers))):
         rows[row.batch].append(row)
-    return [
-        AcknowledgementBatch(
-            number or 0,
-            first.made_at,
-            first.made_by,
-            first.comment,
-            first.undone_at,
-            first.undone_by,
-            Counter(row.reason for row in rows[number]),
-        )
-        for number in numbers
-        for first in rows[number][:1]
-    ]
+    return [rows[number] for number in numbers]
 
 
-def newest_batch(session: Session, heliostat: str, reason: str) -> AcknowledgementBatch | None:
-    """The newest batch with an alarm of this reason that was not undone; None without one."""
+def newest_batch(session: Session, heliostat: str, reason: str) -> list[AcknowledgementRow]:
+    """The newest batch with an alarm of this reason that was not undone; empty without one."""
     numbers = [
         row.batch
         for key, row in acknowledged(session).items()
         if key[:2] == (heliostat, reason) and row.batch is not None
     ]
-    return list_batches(session, 1, number=max(numbers))[0] if numbers else None
+    return list_batches(session, 1, number=max(numbers))[0] if numbers else []
 
 
 # --- history
 # --------------------------------------------------------------------------------------------------
 
 
-class OpenAlarm(NamedTuple):
-    """An alarm that is present, with the heliostat's name and its acknowledgement."""
-
-    heliostat: str | None
-    row: AlarmRow
-    acknowledgement: AcknowledgementRow | None
-
-
-def _open(*columns: Any) -> Select[Any]:
-    """Query present alarms with their acknowledgements."""
+def open_with_acknowledgements(*columns: Any) -> Select[Any]:
+    """Query columns of present alarms, and of the acknowledgement of each that has one."""
     made, row = AcknowledgementRow, AlarmRow
     is_of_row = (
         (made.fingerprint == row.fingerprint)
@@ -204,17 +169,17 @@ def _open(*columns: Any) -> Select[Any]:
     return query.where(row.ended_at.is_(None))
 
 
-def open_alarms(session: Session) -> list[OpenAlarm]:
+def open_alarms(session: Session) -> list[StoredAlarm]:
     """Return the alarms that are present."""
-    query = _open(HeliostatRow.name, AlarmRow, AcknowledgementRow)
-    query = query.outerjoin(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
-    return [OpenAlarm(*found) for found in session.execute(query)]
+    query = _alarms().where(AlarmRow.ended_at.is_(None))
+    return [StoredAlarm(*found) for found in session.execute(query)]
 
 
 def count_unacknowledged(session: Session) -> dict[str, int]:
     """The number of present alarms that are not acknowledged, by reason."""
-    query = _open(AlarmRow.reason, func.count()).where(AcknowledgementRow.id.is_(None))
-    return {row[0]: row[1] for row in session.execute(query.group_by(AlarmRow.reason))}
+    query = open_with_acknowledgements(AlarmRow.reason, func.count())
+    query = query.where(AcknowledgementRow.id.is_(None)).group_by(AlarmRow.reason)
+    return {row[0]: row[1] for row in session.execute(query)}
 
 
 def record_alarms(
@@ -267,7 +232,7 @@ def list_history(
     after: int | None = None,
     reason: str | None = None,
     heliostat: str | None = None,
-) -> list[AlarmHistory]:
+) -> list[StoredAlarm]:
     """Up to ``limit`` alarms older than record ``after``, the newest first."""
     query = _alarms().order_by(AlarmRow.id.desc()).limit(limit)
     if after is not None:
@@ -283,4 +248,4 @@ def list_history(
     )
     for name, row in session.execute(seen.order_by(AcknowledgementRow.id)):
         made[_key(name, row)].append(row)
-    return [AlarmHistory(name, row, tuple(made[_key(name, row)])) for name, row in rows]
+    return [StoredAlarm(name, row, made[_key(name, row)]) for name, row in rows]

@@ -4,11 +4,14 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Annotated
 
+from pydantic import Field, computed_field
 from sqlalchemy.orm import Session
 
 from service import store
 from service.base.errors import ConflictError, NotFoundError
+from service.base.fields import Model, Name
 from service.store import acknowledgements
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow
@@ -21,14 +24,17 @@ from service.twin.alarms.reasons import REASONS, Reason, Severity
 from service.twin.runtime.runtime import Runtime
 
 
-@dataclass(frozen=True)
-class AlarmFilter:
+class AlarmFilter(Model):
     """Which alarms are wanted; None admits all."""
 
-    reason: Reason | None = None
-    severity: int | None = None
-    heliostat: str | None = None
-    acknowledged: bool | None = None
+    reason: Reason | None = Field(default=None, description="Only this reason.")
+    severity: int | None = Field(
+        default=None, ge=1, le=3, description="Only this severity: 1, 2 or 3."
+    )
+    heliostat: Name | None = Field(default=None, description="Only this heliostat.")
+    acknowledged: bool | None = Field(
+        default=None, description="Only alarms that are, or are not, acknowledged."
+    )
 
     def choose(self, alarms: Iterable[Alarm]) -> list[Alarm]:
         """The wanted ones, in their order."""
@@ -46,27 +52,35 @@ class AlarmFilter:
 class AlarmsTogether:
     """Alarms that are acknowledged together."""
 
-    alarms: tuple[Alarm, ...]
+    members: Annotated[Sequence[Alarm], Field(exclude=True)]
 
     @property
     def count(self) -> int:
         """The number of alarms."""
-        return len(self.alarms)
+        return len(self.members)
 
+    @computed_field
     @property
     def first_at(self) -> datetime:
-        """Since when the oldest alarm lasts."""
-        return min(alarm.since for alarm in self.alarms)
+        """When it began."""
+        return min(alarm.since for alarm in self.members)
 
+    @computed_field
     @property
     def last_at(self) -> datetime:
-        """Since when the newest alarm lasts."""
-        return max(alarm.since for alarm in self.alarms)
+        """When the newest of them began."""
+        return max(alarm.since for alarm in self.members)
 
-    def token_for(self, name: str) -> str:
+    @property
+    def kind(self) -> str:
+        """What they have in common: a cause, or a reason."""
+        return "cause"
+
+    @property
+    def token(self) -> str:
         """Identifier of exactly these alarms, which changes if one comes, goes or changes."""
-        ids = "\n".join(sorted(alarm.id for alarm in self.alarms))
-        return f"{name}:{hashlib.sha256(ids.encode()).hexdigest()[:12]}"
+        ids = "\n".join(sorted(alarm.id for alarm in self.members))
+        return f"{self.kind}:{hashlib.sha256(ids.encode()).hexdigest()[:12]}"
 
 
 @dataclass(frozen=True)
@@ -81,18 +95,18 @@ class AlarmGroup(AlarmsTogether):
         return REASONS[self.reason].severity
 
     @property
-    def token(self) -> str:
-        """Identifier of the group with exactly these alarms."""
-        return self.token_for(self.reason)
+    def kind(self) -> str:
+        """The reason."""
+        return self.reason
 
 
 def group_alarms(alarms: Sequence[Alarm]) -> list[AlarmGroup]:
     """Group alarms by reason, the most urgent reason first."""
     groups = [
-        AlarmGroup(tuple(alarm for alarm in alarms if alarm.reason == reason), reason)
+        AlarmGroup([alarm for alarm in alarms if alarm.reason == reason], reason)
         for reason in REASONS
     ]
-    return [group for group in groups if group.alarms]
+    return [group for group in groups if group.members]
 
 
 def acknowledge(

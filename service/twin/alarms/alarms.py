@@ -9,20 +9,23 @@ or when its measured value doubles.
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from datetime import time as clock
+from functools import cached_property
 from itertools import groupby, pairwise
 from operator import itemgetter
-from typing import NamedTuple, cast
+from typing import Annotated, NamedTuple
 from zoneinfo import ZoneInfo
 
+from pydantic import ConfigDict, Field, computed_field
 from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
 from model.times import format_minute
+from service.base.fields import From
 from service.base.settings import Settings
 from service.store import acknowledgements, field_state
 from service.store.columns import now
@@ -43,32 +46,54 @@ from service.store.tables import (
 )
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
 from service.twin.alarms.light import LostLight, find_lost_light
-from service.twin.alarms.reasons import REASONS, Reason, Severity
+from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, ReasonOf, SeverityOf
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
 
+AlarmId = Annotated[
+    str,
+    Field(
+        max_length=80,
+        pattern=r"^[A-Za-z0-9_-]+:[a-z_]+:[0-9a-f]{8}$",
+        description=(
+            "The item and its reason as they are now; another where the reason changes or returns."
+        ),
+        examples=["AA39:moved:1f0c22ab"],
+    ),
+]
+
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm of a heliostat, or of the plant if ``heliostat`` is None.
+    """Something that an operator should look at."""
 
-    ``measurements`` are identifiers of the heliostat's measurements to look at. ``acknowledgement``
-    is the number of the batch in which it was acknowledged, for ``acknowledged_reason``.
-    """
+    reason: ReasonOf
+    heliostat: HeliostatOrPlant
+    since: From
+    message: Annotated[str, Field(description="What is wrong.")]
+    action: Annotated[str, Field(description="What to do.")]
+    fingerprint: Annotated[str, Field(exclude=True)]
+    acknowledged_by: Annotated[
+        str | None, Field(description="Name of the key; null if not acknowledged.")
+    ] = None
+    acknowledged_at: Annotated[datetime | None, Field(description="When; null: it is not.")] = None
+    measurements: Annotated[
+        list[str],
+        Field(description="Ids of the heliostat's measurements to look at, where there are some."),
+    ] = field(default_factory=list)
+    acknowledged_reason: Annotated[
+        str | None, Field(description="Why; null: it is not, or none was given.")
+    ] = None
+    acknowledgement: Annotated[
+        int | None,
+        Field(
+            description="Number of the acknowledgement, which may be undone; null: there is none."
+        ),
+    ] = None
 
-    reason: Reason
-    heliostat: str | None
-    since: datetime
-    message: str
-    action: str
-    fingerprint: str
-    acknowledged_by: str | None = None
-    acknowledged_at: datetime | None = None
-    measurements: tuple[str, ...] = ()
-    acknowledged_reason: str | None = None
-    acknowledgement: int | None = None
+    __pydantic_config__ = ConfigDict(json_schema_serialization_defaults_required=True)
 
     @property
     def key(self) -> acknowledgements.Key:
@@ -85,15 +110,17 @@ class Alarm:
             acknowledgement=row.batch,
         )
 
-    @property
-    def id(self) -> str:
-        """Identifier from heliostat, reason and fingerprint; it changes with the fingerprint."""
+    @computed_field
+    @cached_property
+    def id(self) -> AlarmId:
+        """The item and its reason as they are now; another where the reason changes or returns."""
         digest = hashlib.sha256(self.fingerprint.encode()).hexdigest()[:8]
         return f"{self.heliostat or 'plant'}:{self.reason}:{digest}"
 
+    @computed_field
     @property
-    def severity(self) -> Severity:
-        """How urgent the reason is: 1 (act now) to 3 (when there is time)."""
+    def severity(self) -> SeverityOf:
+        """By the reason: 1 act now, 2 act today, 3 when there is time."""
         return REASONS[self.reason].severity
 
 
@@ -108,31 +135,31 @@ class AlarmList(NamedTuple):
     pending: int
 
 
+RECORDED = tuple(one.name for one in fields(Alarm) if hasattr(AlarmRow, one.name))
+"""Fields of an alarm that its row has, too."""
+
+_COLUMNS = {
+    "heliostat": HeliostatRow.name,
+    "acknowledged_by": AcknowledgementRow.made_by,
+    "acknowledged_at": AcknowledgementRow.made_at,
+    "acknowledged_reason": func.nullif(AcknowledgementRow.comment, ""),
+    "acknowledgement": AcknowledgementRow.batch,
+} | {name: getattr(AlarmRow, name) for name in RECORDED}
+_OF_ALARM = [_COLUMNS[one.name] for one in fields(Alarm)]
+
+
 def read_alarms(session: Session) -> AlarmList:
     """Read all alarms, sorted by urgency of the reason, then by time with the newest first."""
-    field = field_state.read_field_state(session)
-    alarms = [_stored_alarm(*found) for found in acknowledgements.open_alarms(session)]
+    state = field_state.read_field_state(session)
+    query = acknowledgements.open_with_acknowledgements(*_OF_ALARM)
+    query = query.outerjoin(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
+    alarms = [Alarm(*row) for row in session.execute(query)]
     order = {reason: place for place, reason in enumerate(REASONS)}
     alarms.sort(
         key=lambda item: (order[item.reason], -item.since.timestamp(), item.heliostat or "")
     )
-    pending = max(field.pending, int(field.marks != read_marks(session)))
-    return AlarmList(alarms, field.computed_at, pending)
-
-
-def _stored_alarm(
-    heliostat: str | None, row: AlarmRow, acknowledgement: AcknowledgementRow | None
-) -> Alarm:
-    alarm = Alarm(
-        cast(Reason, row.reason),
-        heliostat,
-        row.since,
-        row.message,
-        row.action,
-        row.fingerprint,
-        measurements=tuple(row.measurements),
-    )
-    return alarm if acknowledgement is None else alarm.with_acknowledgement(acknowledgement)
+    pending = max(state.pending, int(state.marks != read_marks(session)))
+    return AlarmList(alarms, state.computed_at, pending)
 
 
 def compute_alarms(
@@ -179,7 +206,7 @@ def find_untrusted(line: HeliostatOverview, at: datetime) -> Alarm | None:
     if surface is None or not surface.warnings:
         return None
     since = surface.warned_since or surface.created_at or at
-    photographs = tuple(surface.suspicious or ())
+    photographs = list(surface.suspicious or ())
     which = _named(photographs)
     return Alarm(
         "untrusted",

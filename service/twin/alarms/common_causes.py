@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby
 from statistics import median
+from typing import Annotated
 
+from pydantic import Field, computed_field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -26,7 +28,7 @@ from service.store.tables import (
     TargetRow,
 )
 from service.twin.alarms.acknowledging import AlarmsTogether
-from service.twin.alarms.alarms import Alarm
+from service.twin.alarms.alarms import Alarm, AlarmId
 from service.twin.alarms.reasons import REASONS, Reason
 
 MIN_ALARMS = 5
@@ -60,24 +62,30 @@ _WHEN_TAKEN: tuple[Reason, ...] = ("accuracy", "fell", "moved", "pointing")
 
 @dataclass(frozen=True)
 class CommonCause(AlarmsTogether):
-    """Alarms that probably have one cause. ``evidence`` is empty if the store has none."""
+    """Alarms that probably have one cause."""
 
-    evidence: tuple[str, ...]
+    evidence: Annotated[
+        tuple[str, ...],
+        Field(description="What the store knows of that time; empty if it knows nothing."),
+    ]
 
+    @computed_field
+    @property
+    def alarms(self) -> dict[Reason, int]:
+        """Number of alarms by their reason."""
+        return Counter(alarm.reason for alarm in self.members)
+
+    @computed_field
     @property
     def heliostats(self) -> list[str]:
         """Names of the heliostats."""
-        return sorted({alarm.heliostat for alarm in self.alarms if alarm.heliostat})
+        return sorted({alarm.heliostat for alarm in self.members if alarm.heliostat})
 
+    @computed_field
     @property
-    def reasons(self) -> dict[Reason, int]:
-        """Number of alarms of each reason."""
-        return dict(Counter(alarm.reason for alarm in self.alarms))
-
-    @property
-    def token(self) -> str:
-        """Identifier of the cause with exactly these alarms."""
-        return self.token_for("cause")
+    def ids(self) -> list[AlarmId]:
+        """Ids of the alarms, to acknowledge them together."""
+        return [alarm.id for alarm in self.members]
 
 
 def find_common_causes(
@@ -96,11 +104,11 @@ def find_common_causes(
     ):
         same = list(causes)
         merged += (
-            [CommonCause(tuple(alarm for one in same for alarm in one.alarms), evidence)]
+            [CommonCause([alarm for one in same for alarm in one.members], evidence)]
             if evidence
             else same
         )
-    return sorted(merged, key=lambda one: -len(one.alarms))
+    return sorted(merged, key=lambda one: -len(one.members))
 
 
 def find_bursts(alarms: Sequence[Alarm]) -> list[tuple[Alarm, ...]]:

@@ -23,7 +23,7 @@ from service.store.columns import EPOCH, now
 from service.store.field_state import apply_pointing_limit, lock_field_state, save_states
 from service.store.job_tables import AlarmRow, JobRow
 from service.store.tables import DecisionRow, MeasurementRow, ModelRow, MountRow, SurfaceRow
-from service.twin.alarms.alarms import Alarm, compute_alarms, find_ended_accuracies
+from service.twin.alarms.alarms import RECORDED, Alarm, compute_alarms, find_ended_accuracies
 from service.twin.alarms.field_overview import (
     LARGE,
     HeliostatOverview,
@@ -177,12 +177,8 @@ def _write(session: Session, reading: _Reading, settings: Settings) -> None:
 
 
 def _columns(alarm: Alarm) -> dict[str, object]:
-    return {
-        "message": alarm.message,
-        "action": alarm.action,
-        "measurements": list(alarm.measurements),
-        "since": alarm.since,
-    }
+    """What is recorded of an alarm in addition to its key."""
+    return {name: getattr(alarm, name) for name in RECORDED if name not in Key._fields}
 
 
 def _ended_accuracies(

@@ -1,6 +1,8 @@
 """Reasons of alarms: their labels and severities."""
 
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import Field
 
 Reason = Literal[
     "queue",
@@ -21,6 +23,13 @@ Reason = Literal[
 ]
 
 Severity = Literal[1, 2, 3]
+
+ReasonOf = Annotated[Reason, Field(description="What kind of alarm it is.")]
+SeverityOf = Annotated[
+    Severity, Field(description="By the reason: 1 act now, 2 act today, 3 when there is time.")
+]
+HeliostatOrPlant = Annotated[str | None, Field(description="null: the plant as a whole.")]
+CountByReason = Annotated[dict[Reason, int], Field(description="Number of alarms by their reason.")]
 
 SEVERITIES: dict[Severity, str] = {1: "Act now", 2: "Act today", 3: "When there is time"}
 """All severities with their labels, the most urgent first."""

@@ -32,8 +32,8 @@ from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
 from service.twin.alarms.reasons import SEVERITIES
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.api.alarms import AlarmCountDep
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
+from service.web.resources.alarms import AlarmCountDep
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])

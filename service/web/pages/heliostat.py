@@ -27,7 +27,6 @@ from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Timeline
 from service.store import acknowledgements
-from service.store.acknowledgements import AcknowledgementBatch
 from service.store.photographs.correction_log import newest_correction
 from service.store.photographs.groups import (
     PhotographFilter,
@@ -73,6 +72,7 @@ from service.web.pages.heliostat_decision import (
     newest_exclusions,
     outlier_evidence,
 )
+from service.web.resources.alarms import AcknowledgementOut
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])
@@ -319,7 +319,7 @@ class _HeliostatData:
     evidence: OutlierEvidence | None
     exclusions: list[Exclusion]
     choice: Choice | None
-    acknowledgement: AcknowledgementBatch | None
+    acknowledgement: AcknowledgementOut | None
 
 
 def _read(
@@ -383,7 +383,7 @@ def _read(
         evidence,
         exclusions,
         choice,
-        seen,
+        AcknowledgementOut.of(seen) if seen else None,
     )
 
 

@@ -1,13 +1,11 @@
 """Tables of the pages as CSV."""
 
-from dataclasses import fields
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
 from service import store
 from service.store.tables import MeasurementRow
-from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_filter import HeliostatFilter, filter_heliostats
 from service.twin.alarms.field_overview import PATIENCE_S, field_totals
 from service.twin.surfaces.accuracy import photograph_name
@@ -34,17 +32,6 @@ def get_field_table(
         for line in summaries
     )
     return sheet_answer("field", columns, rows)
-
-
-@router.get("/alarms.csv")
-def get_alarms_table(runtime: RuntimeDep) -> Response:
-    """All alarms, acknowledged or not."""
-    with runtime.database.reading() as session:
-        items = read_alarms(session).alarms
-    columns = ["id", "severity", *(one.name for one in fields(Alarm) if one.name != "fingerprint")]
-    return sheet_answer(
-        "alarms", columns, ([getattr(item, name) for name in columns] for item in items)
-    )
 
 
 _QUALITY = (
