@@ -1,14 +1,15 @@
 """Rank likely causes of a heliostat's poor forecasts, each with its evidence and the next step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import date, datetime, timedelta
 from datetime import time as clock
 from statistics import median
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
+from pydantic import ConfigDict, Field, computed_field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -142,21 +143,30 @@ class HeliostatFacts:
 
 @dataclass(frozen=True)
 class LikelyCause:
-    """A likely cause with one sentence of evidence.
+    """A likely cause of poor forecasts, with its evidence."""
 
-    ``share`` [1] is the share of the poor photographs that the evidence concerns; for causes that
-    concern all of them, the share of the shortfall that it explains. ``photographs`` are
-    identifiers, ``day`` and ``study`` where to look, ``since`` when it began.
-    """
+    kind: Annotated[CauseKind, Field(description="Which cause it is.")]
+    explained_share: Annotated[
+        float,
+        Field(
+            description="Share of the poor photographs, or of the shortfall, that it explains [1]."
+        ),
+    ]
+    evidence: Annotated[str, Field(description="What the store knows of it.")]
+    measurements: Annotated[
+        Sequence[str], Field(description="Ids of the measurements that show it.")
+    ] = field(default_factory=tuple)
+    day: Annotated[date | None, Field(description="The day of haze, in the plant's time zone.")] = (
+        None
+    )
+    since: Annotated[datetime | None, Field(description="When the mirror changed.")] = None
+    study: Annotated[
+        int | None, Field(description="The study that found what the model lacks.")
+    ] = None
 
-    kind: CauseKind
-    share: float
-    evidence: str
-    photographs: tuple[str, ...] = ()
-    day: date | None = None
-    since: datetime | None = None
-    study: int | None = None
+    __pydantic_config__ = ConfigDict(json_schema_serialization_defaults_required=True)
 
+    @computed_field
     @property
     def label(self) -> str:
         """The cause in words."""
@@ -221,7 +231,7 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
         said = f"the times of {undated} of {count_photographs(len(facts.photographs))} are unknown"
         found.append(LikelyCause("times_unknown", 0.0, said))
     order = list(CAUSES)
-    return sorted(found, key=lambda one: (-one.share, order.index(one.kind)))
+    return sorted(found, key=lambda one: (-one.explained_share, order.index(one.kind)))
 
 
 def _of_photographs(

@@ -1,13 +1,10 @@
 """Likely causes of a heliostat's poor forecasts."""
 
-from datetime import date, datetime
-
 from fastapi import APIRouter
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from service import store
-from service.base.fields import from_row
-from service.twin.alarms.causes import CauseKind, rank_causes, read_facts
+from service.twin.alarms.causes import LikelyCause, rank_causes, read_facts
 from service.twin.alarms.field_overview import read_summaries, with_pointing
 from service.twin.surfaces.accuracy import ComparisonResult
 from service.web.auth.dependencies import READ, ComparisonCacheDep, NamePath, RuntimeDep
@@ -17,22 +14,7 @@ from service.web.responses.paging import Page
 router = APIRouter(prefix="/heliostats/{name}/causes", tags=["heliostats"])
 
 
-class LikelyCauseOut(BaseModel):
-    """A likely cause of poor forecasts, with its evidence."""
-
-    kind: CauseKind = Field(description="Which cause it is.")
-    label: str = Field(description="The cause in words.")
-    explained_share: float = Field(
-        description="Share of the poor photographs, or of the shortfall, that it explains [1]."
-    )
-    evidence: str = Field(description="What the store knows of it.")
-    measurements: list[str] = Field(description="Ids of the measurements that show it.")
-    day: date | None = Field(description="The day of haze, in the plant's time zone.")
-    since: datetime | None = Field(description="When the mirror changed.")
-    study: int | None = Field(description="The study that found what the model lacks.")
-
-
-class LikelyCausePage(Page[LikelyCauseOut]):
+class LikelyCausePage(Page[LikelyCause]):
     """Likely causes, the one that explains most first; none for a good heliostat."""
 
     pending: bool = Field(
@@ -53,8 +35,4 @@ def list_causes(name: NamePath, runtime: RuntimeDep, cache: ComparisonCacheDep) 
     with runtime.database.reading() as session:
         facts = read_facts(session, line, row, surface, comparisons, runtime.settings)
         found = [] if facts is None else rank_causes(facts)
-    items = [
-        from_row(LikelyCauseOut, one, explained_share=one.share, measurements=list(one.photographs))
-        for one in found
-    ]
-    return LikelyCausePage(items=items, next=None, pending=compared is None)
+    return LikelyCausePage(items=found, next=None, pending=compared is None)

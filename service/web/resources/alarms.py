@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 from datetime import datetime
 from operator import attrgetter
 from typing import Annotated, Literal, NamedTuple, Self, get_args
@@ -10,9 +9,9 @@ from urllib.parse import urlencode
 
 from fastapi import APIRouter, Body, Depends, Form, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import BaseModel, Field, computed_field, model_validator
+from pydantic import BaseModel, Field, TypeAdapter, computed_field, model_validator
 
-from service.base import fields as common
+from service.base import fields
 from service.base.errors import ConflictError
 from service.base.fields import (
     Author,
@@ -88,7 +87,8 @@ COMMENTS: tuple[Comment, ...] = get_args(Comment)
 """Reasons to choose from; the last one needs words."""
 
 _LABELS = {"reasons": REASONS, "severities": SEVERITIES}
-_COLUMNS = ("id", "severity", *(one.name for one in fields(Alarm) if one.name != "fingerprint"))
+_SCHEMA = TypeAdapter(Alarm).json_schema(mode="serialization")
+_COLUMNS = list(dict.fromkeys(["id", "severity", *_SCHEMA["properties"]]))
 
 
 class AlarmPage(Page[Alarm]):
@@ -211,7 +211,7 @@ class AcknowledgementsIn(Model):
     ids: list[AlarmId] = Field(
         min_length=1, max_length=500, description="Ids of items of `GET /v1/alarms`."
     )
-    reason: Annotated[common.Reason, Field(description="Why they are acknowledged.")]
+    reason: Annotated[fields.Reason, Field(description="Why they are acknowledged.")]
 
 
 class AcknowledgementForm(Model):

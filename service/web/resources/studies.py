@@ -185,12 +185,6 @@ class DecisionForm(WithdrawIn):
         return go_to("/studies#studies-title" if self.back else f"/studies/{number}")
 
 
-class PredictAgainForm(Model):
-    """The button that predicts surfaces again with the current model."""
-
-    method: Method = "refined"
-
-
 class NewStudyForm(Model):
     """The body of a new study as a form.
 
@@ -504,7 +498,7 @@ def post_withdraw_form(
 
 @pages.post("/studies/predictions", dependencies=[OPERATE])
 def post_predict_again_form(
-    form: Annotated[PredictAgainForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+    runtime: RuntimeDep, identity: IdentityDep, method: Annotated[Method, Form()] = "refined"
 ) -> Response:
     """Predict the active surfaces again that another version of the model made.
 
@@ -517,5 +511,5 @@ def post_predict_again_form(
         raise ConflictError(
             "all surfaces were made by the current model, or one that was waits aside"
         )
-    body = PredictionsIn(heliostats=names, method=form.method)
+    body = PredictionsIn(heliostats=names, method=method)
     return go_to(f"/jobs/{enqueue(runtime, KINDS['predictions'], body, identity.name).id}")
