@@ -19,13 +19,18 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def cell(value: Any) -> Any:
-    """Convert a value to a cell: numbers stay numbers, and text never becomes a formula."""
+    """Convert a value to a cell: numbers stay numbers, and text never becomes a formula.
+
+    A list is of names, which are separated by spaces.
+    """
     if value is None:
         return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
         return value
+    if isinstance(value, list):
+        value = " ".join(value)
     text = format_time(value) if isinstance(value, datetime) else str(value)
     return f"'{text}" if text.startswith(_FORMULA) else text
 

@@ -24,8 +24,9 @@ def test_text_is_never_a_formula(text: str):
 
 def test_numbers_stay_numbers():
     moment = datetime(2026, 6, 21, tzinfo=UTC)
-    values: list[Any] = [-1.5, 0, None, True, "a=b", moment]
-    assert [cell(value) for value in values] == [-1.5, 0, "", "yes", "a=b", "2026-06-21T00:00:00Z"]
+    values: list[Any] = [-1.5, 0, None, True, "a=b", moment, ["101", "102"]]
+    cells = [-1.5, 0, "", "yes", "a=b", "2026-06-21T00:00:00Z", "101 102"]
+    assert [cell(value) for value in values] == cells
 
 
 def sheet(client: TestClient, path: str) -> list[dict[str, str]]:
