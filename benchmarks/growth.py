@@ -246,7 +246,7 @@ class Filler:
             at,
         )
         row.sun_azimuth_deg, row.sun_elevation_deg, row.dni_w_m2 = 200.0, 45.0, 1000.0
-        row.losses = dict(light_watts(Losses(8.2, *[0.9] * 7), row.dni_w_m2))
+        row.losses = dict(light_watts(Losses(8.2, *[0.9] * 8), row.dni_w_m2))
         row.normalised, row.rows, row.columns, row.peak_w_m2, row.power_w = (
             False,
             256,

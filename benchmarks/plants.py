@@ -50,7 +50,7 @@ def traced(
 ) -> dict[str, Losses]:
     """Losses of heliostats that shade and block each other."""
     model = PlantModel(JUELICH, optics)
-    goals = aims or dict.fromkeys(heliostats, receiver.aim)
+    goals = aims or {name: receiver.aim_of(one.position) for name, one in heliostats.items()}
     around = aligned_field([(one, goals[name]) for name, one in heliostats.items()], sun, model)
     setups = [
         Setup(one, control_points(one), sun, receiver.middle, aim=goals[name])

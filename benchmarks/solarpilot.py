@@ -26,7 +26,6 @@ from service.base.progress import no_progress
 from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.solarpilot import read_solarpilot
-from service.sources.plant_receivers import aim_of
 
 Array = np.ndarray
 
@@ -182,7 +181,7 @@ def our_plant(places: list[list[float]], folder: Path) -> PlantDescription:
 def our_efficiency(plant: PlantDescription, azimuth_deg: float, elevation_deg: float) -> float:
     """Optical efficiency of the field; azimuth from north over east."""
     receiver = plant.receivers["main"]
-    aims = {name: aim_of(receiver, one.position) for name, one in plant.plant.heliostats.items()}
+    aims = {name: receiver.aim_of(one.position) for name, one in plant.plant.heliostats.items()}
     request = FieldRequest("main", azimuth_deg % 360, elevation_deg, 1000.0, dict(aims))
     return trace_field(plant, request, no_progress).report["field"]["optical_efficiency"]
 

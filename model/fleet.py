@@ -100,7 +100,7 @@ class Losses:
     ----------
     area : float [m2]
         Of its facets.
-    cosine, shading, blocking, reflectance, attenuation, intercept, absorptance : float
+    cosine, shading, blocking, reflectance, cleanliness, attenuation, intercept, absorptance : float
     """
 
     area: float
@@ -108,6 +108,7 @@ class Losses:
     shading: float
     blocking: float
     reflectance: float
+    cleanliness: float
     attenuation: float
     intercept: float
     absorptance: float
@@ -121,7 +122,7 @@ class Losses:
     def intercepted(self) -> float:
         """Share of that light that reaches the receiver."""
         mirror = self.cosine * self.shading * self.blocking * self.reflectance
-        return mirror * self.attenuation * self.intercept
+        return mirror * self.cleanliness * self.attenuation * self.intercept
 
 
 LOSSES = tuple(f.name for f in fields(Losses) if f.name != "area")
@@ -138,10 +139,12 @@ def losses_of(
     """Losses by name of heliostats whose power on the receiver is ``intercepted`` (B,) [W]."""
     areas = np.array([heliostat.area for heliostat in heliostats])
     reflectance = optics.reflectivity * np.array([h.optics.reflectance for h in heliostats])
+    clean = reflectance * np.array([h.optics.cleanliness for h in heliostats])
     lit, free, power, reached = (
         values.double().numpy() for values in (beams.lit, beams.free, beams.power, intercepted)
     )
-    stages = [areas, *lit.T, free, free * reflectance, power / max(optics.dni, 1e-300)]
+    stages = [areas, *lit.T, free, free * reflectance, free * clean]
+    stages.append(power / max(optics.dni, 1e-300))
     stages.append(reached.clip(min=0, max=power) / max(optics.dni, 1e-300))
     shares = [
         np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)

@@ -145,15 +145,19 @@ class MirrorOptics:
         Standard deviation of the normals per axis.
     pointing_error : float [rad]
         Standard deviation of the reflected beam's direction per axis.
+    cleanliness : float
+        Share of the reflected light that soiling leaves.
     """
 
     reflectance: float = 1.0
     slope_error: float = 0.0
     pointing_error: float = 0.0
+    cleanliness: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.reflectance <= 1:
-            raise InvalidInputError(f"reflectance must lie in (0, 1], got {self.reflectance:g}")
+        for name in ("reflectance", "cleanliness"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidInputError(f"{name} must lie in (0, 1], got {getattr(self, name):g}")
         for name in ("slope_error", "pointing_error"):
             if not 0 <= getattr(self, name) < 0.1:
                 raise InvalidInputError(
@@ -456,10 +460,9 @@ class TargetPlane:
         """No numbers besides those of the rectangle."""
         return {}
 
-    @property
-    def aim(self) -> Vector:
-        """Its middle."""
-        return self.center
+    def aim_of(self, mirrors: Vector) -> Vector:
+        """Its middle (..., 3) [m], for all mirrors (..., 3) [m]."""
+        return np.broadcast_to(self.center, mirrors.shape)
 
     def grid(self, rows: int, columns: int) -> SurfaceGrid:
         """Places of the map."""
@@ -522,9 +525,8 @@ class Receiver(Protocol):
     def center(self) -> Vector:
         """Middle of the lit surface (3,) [m] in ENU."""
 
-    @property
-    def aim(self) -> Vector:
-        """Default aim of mirrors (3,) [m] in ENU."""
+    def aim_of(self, mirrors: Vector) -> Vector:
+        """Default aims (..., 3) [m] of mirrors (..., 3) [m], in ENU."""
 
     @property
     def normal(self) -> Vector:
@@ -650,16 +652,24 @@ class Cylinder:
         """The point (3,) [m] of its axis at mid height."""
         return self.center - self.radius * self.normal
 
-    @property
-    def aim(self) -> Vector:
-        """The middle of a surface up to half around; else the axis, so that each mirror aims at the
-        surface toward it.
+    def aim_of(self, mirrors: Vector) -> Vector:
+        """The points (..., 3) [m] at mid height that face mirrors (..., 3) [m].
+
+        On a part of a cylinder it is the middle of what a mirror sees, across its beam.
         """
-        return self.center if self.opening_deg <= 180 else self.axis
+        outward, half = mirrors - self.axis, np.radians(self.opening_deg) / 2
+        facing = np.arctan2(outward @ self.right, outward @ self.normal)
+        angles = facing
+        if self.opening_deg < 360:
+            low = np.maximum(-half, facing - np.pi / 2)
+            high = np.minimum(half, facing + np.pi / 2)
+            across = (np.sin(low - facing) + np.sin(high - facing)) / 2
+            angles = np.clip(facing + np.arcsin(across), -half, half)
+        return np.asarray(self.axis + self.radius * self._normals(angles))
 
     def _at(self, angles: Vector, heights: Vector) -> SurfaceGrid:
         """Places at angles [rad] from the middle and heights [m] over it; areas are zero."""
-        normals = np.cos(angles)[:, None] * self.normal + np.sin(angles)[:, None] * self.right
+        normals = self._normals(angles)
         points = self.axis + self.radius * normals + heights[:, None, None] * self.up
         return SurfaceGrid(points, np.broadcast_to(normals, points.shape), np.zeros(()))
 
@@ -674,7 +684,12 @@ class Cylinder:
     def facing(self, points: Vector) -> Vector:
         """Unit normals (..., 3) of the lit surface where it is nearest to points (..., 3) [m]."""
         outward, half = points - self.axis, np.radians(self.opening_deg) / 2
-        angles = np.arctan2(outward @ self.right, outward @ self.normal).clip(-half, half)
+        return self._normals(
+            np.arctan2(outward @ self.right, outward @ self.normal).clip(-half, half)
+        )
+
+    def _normals(self, angles: Vector) -> Vector:
+        """Unit normals (..., 3) at angles (...) [rad] from the middle."""
         return np.asarray(
             np.cos(angles)[..., None] * self.normal + np.sin(angles)[..., None] * self.right
         )

@@ -37,10 +37,9 @@ class _OfPanels:
         """Mean of the panels' middles."""
         return np.asarray(np.mean([panel.center for panel in self.panels], axis=0))
 
-    @property
-    def aim(self) -> Vector:
-        """Their middle."""
-        return self.center
+    def aim_of(self, mirrors: Vector) -> Vector:
+        """Their middle (..., 3) [m], for all mirrors (..., 3) [m]."""
+        return np.broadcast_to(self.center, mirrors.shape)
 
     @property
     def normal(self) -> Vector:
@@ -137,10 +136,9 @@ class Cavity(_OfPanels):
         if spread[2] > 1e-3 * spread[0] or spread[1] < 1e-6 * spread[0]:
             raise InvalidInputError(f"receiver {self.name}: aperture must be a plane polygon")
 
-    @property
-    def aim(self) -> Vector:
-        """Middle of the aperture's rectangle."""
-        return self._opening().center
+    def aim_of(self, mirrors: Vector) -> Vector:
+        """Middle of the aperture's rectangle (..., 3) [m], for all mirrors (..., 3) [m]."""
+        return np.broadcast_to(self._opening().center, mirrors.shape)
 
     def _opening(self) -> TargetPlane:
         """The rectangle in the aperture's plane that bounds it."""

@@ -30,7 +30,7 @@ def k_factor_aims(kernels: Kernels, limit: Tensor, receiver: Receiver) -> AimPla
     defocused.
     """
     spread = image_spread(kernels)[:, 1]
-    middle = torch.tensor(receiver.aim).to(kernels.aims)
+    middle = torch.tensor(receiver.aim_of(kernels.mirrors.double().numpy())).to(kernels.aims)
     middle_up = ((middle - kernels.aims) * kernels.axes[:, 1]).sum(dim=1)
     sector, turn = _sectors(kernels)
     k = torch.full((SECTORS,), _FIRST_K)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 from torch.utils.checkpoint import checkpoint
 
-from model.errors import InvalidInputError, ModelError, UnreachableError
+from model.errors import InvalidInputError, ModelError
 from model.fleet import Superposition, Tile, in_parts
 from model.plant import Receiver, SurfaceGrid, TouchingPlanes, inside_outline
 from model.setup import Setup
@@ -352,21 +352,6 @@ class ImageTracer:
             spread=_spread(rays, optics).to(single),
             power=(rays.power.sum(-1) * irradiance_of(scene, optics, rays.slant_range)).to(single),
         )
-
-
-def aim_in_front(receiver: Receiver, mirror: Array) -> Array:
-    """The point (3,) [m] in front of a receiver's default aim, on the plane that touches it toward
-    a mirror (3,) [m].
-
-    Beams to a point inside of a receiver meet its surface elsewhere. For a mirror that sees nothing
-    of the receiver it is the default aim.
-    """
-    try:
-        plane = receiver.touching(mirror[None])
-    except UnreachableError:
-        return receiver.aim
-    normal = plane.axes[0, 2]
-    return np.asarray(receiver.aim + ((plane.centers[0] - receiver.aim) @ normal) * normal)
 
 
 def _through(points: Array, mirrors: Array, origins: Array, axes: Array) -> Array:

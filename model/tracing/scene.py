@@ -165,7 +165,7 @@ class Scene:
     coverage : Tensor (B, F, n, n) or None
         Share of each facet's cells within its outline; None for facets that are rectangles.
     reflectance, slope_error, pointing_error : Tensor (B,) or None
-        `MirrorOptics` of each mirror, in addition to `Optics`.
+        `MirrorOptics` of each mirror, in addition to `Optics`; reflectance times cleanliness.
     """
 
     control_points: Tensor
@@ -316,8 +316,10 @@ def _mirror_tensors(
             stacked_rectangles([none if s.neighbours is None else s.neighbours for s in setups])
         )
     if any(heliostat.optics != PERFECT for heliostat in heliostats):
-        for name in ("reflectance", "slope_error", "pointing_error"):
-            tensors[name] = tensor([getattr(h.optics, name) for h in heliostats])
+        optics = [heliostat.optics for heliostat in heliostats]
+        tensors["reflectance"] = tensor([one.reflectance * one.cleanliness for one in optics])
+        for name in ("slope_error", "pointing_error"):
+            tensors[name] = tensor([getattr(one, name) for one in optics])
     outlines = {tuple(facet.outline for facet in h.facets) for h in heliostats}
     if any(outline is not None for facets in outlines for outline in facets):
         cells = {facets: tensor([coverage(outline) for outline in facets]) for facets in outlines}

@@ -143,16 +143,19 @@ def project(
         opening = touching.opening(window.rows, window.columns)
         kernels = kernels * torch.tensor(opening).to(kernels)
     step = max(1, _PROJECTED // grid.areas.size)
-    image, intercepted = torch.zeros(resolution), []
+    image, intercepted, beams = torch.zeros(resolution), [], Beams.of(rays, irradiance)
     areas = torch.tensor(grid.areas).to(kernels)
     for start in range(0, scene.batch, step):
         part = slice(start, start + step)
         seen = _projected(kernels[part], scene, part, window, grid)
         if touching.screens is not None:
             seen = seen * in_sight(touching.screens, scene.center[part], grid)
-        image = image + seen.sum(0)
-        intercepted.append((seen * areas).sum(dim=(-2, -1)))
-    return SuperposedFlux(image, Beams.of(rays, irradiance), torch.cat(intercepted))
+        reached = (seen * areas).sum(dim=(-2, -1))
+        # Coarse pixels may add up to some per mille more than the beam, if all of it lands there.
+        kept = (beams.power[part] / reached.clamp(min=1e-30)).clamp(max=1)
+        image = image + (seen * kept[:, None, None]).sum(0)
+        intercepted.append(reached * kept)
+    return SuperposedFlux(image, beams, torch.cat(intercepted))
 
 
 def _window(touching: TouchingPlanes, grid: SurfaceGrid) -> Window:

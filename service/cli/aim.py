@@ -162,9 +162,9 @@ def trace_kernels(
     They are traced from near to far, since images of one tile have one size. ``rng`` draws errors
     of the surfaces that have standard deviations.
     """
-    lit = light_field(plant, request, ROWS, in_front=True)
+    lit = light_field(plant, request, ROWS)
     require_few_pairs(len(lit.aimed.setups), lit.task.resolution)
-    goal, skipped = lit.task.receiver.aim, dict[str, str]()
+    goal, skipped = lit.task.receiver.center, dict[str, str]()
     setups = sorted(lit.aimed.setups, key=lambda one: math.dist(one.heliostat.position, goal))
     if rng is not None and request.surfaces is not None:
         setups = [_drawn(setup, request.surfaces, rng) for setup in setups]

@@ -10,7 +10,6 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from model.aiming.kernels import aim_in_front
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
 from model.fleet import FleetFlux, Superposition, aligned_field, superpose, tiles
@@ -148,14 +147,10 @@ class LitField:
     neighbours: Neighbours
 
 
-def light_field(
-    plant: PlantDescription, request: FieldRequest, rows: int = ROWS, *, in_front: bool = False
-) -> LitField:
+def light_field(plant: PlantDescription, request: FieldRequest, rows: int = ROWS) -> LitField:
     """Aim a plant's heliostats; errors as of `trace_field`.
 
-    ``rows`` are those of the map if the request says nothing. ``in_front`` aims at the surface
-    toward each mirror by default, where a beam to a point inside of the receiver would meet it
-    elsewhere.
+    ``rows`` are those of the map if the request says nothing.
     """
     receiver = _receiver(plant, request.receiver)
     sun = sun_direction(request.azimuth_deg, request.elevation_deg)
@@ -163,7 +158,7 @@ def light_field(
     if dni is None:
         dni = clear_sky_dni(request.elevation_deg, plant.altitude)
     model = PlantModel(plant.plant.site, plant.optics).with_dni(dni)
-    aimed = _aimed(plant, receiver, request, sun, in_front)
+    aimed = _aimed(plant, receiver, request, sun)
     field_around = [(one.heliostat, one.goal) for one in aimed.setups] + aimed.others
     task = Superposition(
         receiver,
@@ -182,9 +177,7 @@ def _receiver(plant: PlantDescription, name: str) -> Receiver:
     return plant.receivers[name]
 
 
-def _aimed(
-    plant: PlantDescription, receiver: Receiver, request: FieldRequest, sun: Array, in_front: bool
-) -> Aimed:
+def _aimed(plant: PlantDescription, receiver: Receiver, request: FieldRequest, sun: Array) -> Aimed:
     """Heliostats with aims and surfaces."""
     found = Aimed()
     for name, heliostat in plant.plant.heliostats.items():
@@ -194,12 +187,10 @@ def _aimed(
             if aim is None:
                 continue
         elif own != receiver.name and own in plant.receivers and _is_shared(plant):
-            found.others.append((heliostat, plant.receivers[own].aim))
+            found.others.append((heliostat, plant.receivers[own].aim_of(heliostat.position)))
             continue
-        elif in_front:
-            aim = aim_in_front(receiver, heliostat.position)
         else:
-            aim = receiver.aim
+            aim = receiver.aim_of(heliostat.position)
         surface = None if request.surfaces is None else read_surface(request.surfaces, heliostat)
         found.without_surface += surface is None and request.surfaces is not None
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface

@@ -18,7 +18,7 @@ from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
 from service.sources.plant_errors import PlantText, mistakes_at
-from service.sources.plant_receivers import AnyReceiver, aim_of, read_receivers, read_targets
+from service.sources.plant_receivers import AnyReceiver, read_receivers, read_targets
 from service.sources.plant_schema import (
     BuieSun,
     FacetFileEntry,
@@ -272,7 +272,7 @@ def place_heliostat(
     """
     entry = placed.entry
     foot = np.array([entry.east_m, entry.north_m, entry.up_m])
-    aim = aim_of(goal, foot)
+    aim = goal.aim_of(foot)
     pivot = foot + np.array([0.0, 0.0, of_type.mount.pivot_height])
     if math.dist(aim, pivot) < _NEAREST:
         raise InvalidInputError(

@@ -97,14 +97,3 @@ def _receiver(name: str, entry: ReceiverEntry) -> AnyReceiver:
             return Panels(name, panels, entry.absorptance)
         return Cavity(name, panels, entry.absorptance, aperture=np.array(entry.aperture_m))
     return _plane(name, entry, entry.absorptance)
-
-
-def aim_of(receiver: AnyReceiver, foot: Array) -> Array:
-    """What a heliostat with its pylon's ``foot`` (3,) [m] is canted and focused to (3,) [m].
-
-    The default aim of a field forecast; on a cylinder the place at mid height that faces the
-    heliostat.
-    """
-    if isinstance(receiver, Cylinder):
-        return receiver.axis + receiver.radius * receiver.facing(foot)
-    return receiver.aim

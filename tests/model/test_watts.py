@@ -88,7 +88,9 @@ def flux_of(
     kind, direction = kind or mirror_type(), sun_direction(*sun)
     heliostats = [kind.heliostat(f"H{n}", foot, receiver.center) for n, foot in enumerate(feet)]
     model = PlantModel(JUELICH, optics)
-    around = aligned_field([(one, receiver.aim) for one in heliostats], direction, model)
+    around = aligned_field(
+        [(one, receiver.aim_of(one.position)) for one in heliostats], direction, model
+    )
     task = Superposition(
         receiver, model, resolution, samples, None if tower is None else tower.outline(direction)
     )
@@ -97,7 +99,7 @@ def flux_of(
 
 def setups(heliostats: list[Heliostat], receiver: Receiver, sun: np.ndarray) -> list[Setup]:
     return [
-        Setup(one, control_points(one), sun, receiver.middle, aim=receiver.aim)
+        Setup(one, control_points(one), sun, receiver.middle, aim=receiver.aim_of(one.position))
         for one in heliostats
     ]
 
@@ -123,6 +125,50 @@ def test_energy_closes_on_every_receiver(receiver: Receiver):
         assert all(0 < factor <= 1 + 1e-6 for factor in factors(one))
     assert 0.5 < whole.intercept <= 1
     assert whole.reflectance == pytest.approx(MIRROR.reflectance)
+
+
+def height_of(found: FleetFlux, receiver: Receiver) -> float:
+    """Height [m] of the light's centre over the receiver's middle."""
+    rows = found.irradiance.sum(axis=1)
+    up = (0.5 - (np.arange(len(rows)) + 0.5) / len(rows)) * receiver.height
+    return float(rows @ up / rows.sum())
+
+
+@pytest.mark.parametrize("foot", [(0.0, 60.0, 0.0), (-30.0, 40.0, 0.0), (90.0, -20.0, 0.0)])
+def test_spots_are_at_mid_height_of_a_cylinder(foot: tuple[float, float, float]):
+    """Beams to the axis meet the surface below, by the radius times the beam's slope."""
+    tall = replace(CYLINDER, height=24.0)
+    kind = mirror_type(facets=facet_grid(1, 1, 0.6, 0.6, 0.0), mount=MountDesign(pivot_height=3.0))
+    height = height_of(flux_of(tall, kind, [foot], resolution=(96, 96)), tall)
+    assert height == pytest.approx(0.0, abs=0.25)
+    below = tall.radius * (tall.center[2] - 3.0) / np.hypot(*foot[:2])
+    assert below > 2.0  # what an aim at the axis would make of it
+
+
+def test_default_aims_face_mirrors():
+    feet = np.array(FEET) + [0.0, -90.0, 0.0]
+    aims = CYLINDER.aim_of(feet)
+    outward = (aims - CYLINDER.axis) / CYLINDER.radius
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=-1), 1)
+    level = (feet - CYLINDER.axis) * [1, 1, 0]
+    np.testing.assert_allclose(outward, level / np.linalg.norm(level, axis=-1)[:, None], atol=1e-9)
+    np.testing.assert_array_equal(BOARD.aim_of(feet), np.tile(BOARD.center, (len(feet), 1)))
+
+
+@pytest.mark.parametrize(
+    ("opening", "azimuth"),
+    [(180.0, 0.0), (60.0, 0.0), (60.0, 60.0), (180.0, 90.0), (120.0, -80.0), (270.0, 0.0)],
+)
+def test_on_a_part_of_a_cylinder_mirrors_aim_at_the_middle_of_what_they_see(
+    opening: float, azimuth: float
+):
+    part = replace(CYLINDER, opening_deg=opening)
+    out = sun_direction(azimuth, 0.0)
+    edges = min(opening / 2, azimuth + 90.0), max(-opening / 2, azimuth - 90.0)
+    across = [np.cross(out, sun_direction(edge, 0.0))[2] for edge in edges]
+    aim = part.aim_of(part.axis + 100 * out) - part.axis
+    assert np.linalg.norm(aim) == pytest.approx(part.radius)
+    assert np.cross(out, aim)[2] / part.radius == pytest.approx(np.mean(across), abs=1e-9)
 
 
 def test_cosine_and_attenuation_are_those_of_geometry():

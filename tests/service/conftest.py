@@ -371,7 +371,7 @@ class FakeOperations:
             center_of_mass=center,
             peak=2.0,
             power=50.0,
-            losses=Losses(30.0, 0.9, 1.0, 1.0, 0.9, 0.95, 0.8, 1.0),
+            losses=Losses(30.0, 0.9, 1.0, 1.0, 0.9, 1.0, 0.95, 0.8, 1.0),
             camera_view=flux,
             model_version="fake",
         )
@@ -393,7 +393,7 @@ class FakeOperations:
             asked.append(tile)
             count = len(tile)
             losses = {
-                setup.heliostat.name: Losses(8.0, 0.75, *[1.0] * 5, task.receiver.absorptance)
+                setup.heliostat.name: Losses(8.0, 0.75, *[1.0] * 6, task.receiver.absorptance)
                 for setup in tile.setups
             }
             light = np.full(task.resolution, 2.0 * count)

@@ -61,8 +61,8 @@ def field(
 ) -> None:
     """Trace the flux of a whole field on a receiver: OUT/flux.npz [W/m2] and OUT/field.json.
 
-    The report has each heliostat's cosine, shading, blocking, reflectance, attenuation, intercept
-    and absorptance.
+    The report has each heliostat's cosine, shading, blocking, reflectance, cleanliness,
+    attenuation, intercept and absorptance.
     """
     import numpy as np
 

@@ -19,7 +19,7 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.aiming.kernels import LARGE_PAIRS, Kernels, aim_in_front, require_few_pairs
+from model.aiming.kernels import LARGE_PAIRS, Kernels, require_few_pairs
 from model.aiming.plan import AimPlan, plan_aims
 from model.ephemeris import sun_positions
 from model.errors import InvalidInputError
@@ -273,7 +273,7 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     if SOURCES not in done:
         with runtime.database.writing() as session:
             context.keep(session, SOURCES, sources)
-    planner = _Planner(context, payload, fleet, _in_front(runtime, fleet), drives, suns)
+    planner = _Planner(context, payload, fleet, _nearest_first(runtime, fleet), drives, suns)
     for index in range(len(suns.steps)):
         if step_name(index) not in done:
             with planner.memory():
@@ -329,7 +329,7 @@ class StepAims:
 class _Planner:
     """Plan the steps of a job, each from the step before.
 
-    ``nearest_first`` is the ``fleet`` as of `_in_front`.
+    ``nearest_first`` is the ``fleet`` as of `_nearest_first`.
     """
 
     context: Context
@@ -531,8 +531,8 @@ def _result(context: Context, asked: AimPlanIn, planner: _Planner) -> Result:
     return Result(result, planner.largest())
 
 
-def _in_front(runtime: Runtime, fleet: Fleet) -> Fleet:
-    """The fleet from near to far, aimed at the surface toward each heliostat.
+def _nearest_first(runtime: Runtime, fleet: Fleet) -> Fleet:
+    """The fleet from near to far, each heliostat with its default aim.
 
     Images of heliostats that are traced together have one size.
     """
@@ -541,10 +541,9 @@ def _in_front(runtime: Runtime, fleet: Fleet) -> Fleet:
         found = session.execute(select(row.name, row.east_m, row.north_m, row.up_m)).all()
     places = {name: np.array([east, north, up]) for name, east, north, up in found}
     known = [name for name in fleet.names if name in places]
-    known.sort(key=lambda name: math.dist(places[name], fleet.receiver.aim))
-    aims = {name: aim_in_front(fleet.receiver, places[name]).tolist() for name in known}
+    known.sort(key=lambda name: math.dist(places[name], fleet.receiver.center))
     unknown = [name for name in fleet.names if name not in places]
-    return replace(fleet, names=[*known, *unknown], aims=aims)
+    return replace(fleet, names=[*known, *unknown], aims={})
 
 
 @dataclass(frozen=True, eq=False)

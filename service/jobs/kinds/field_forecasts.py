@@ -8,7 +8,6 @@ from hashlib import sha256
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from sqlalchemy.orm import Session
 
@@ -65,8 +64,8 @@ class FleetIn(Model):
     aim_point_m: Position | None = Field(
         default=None,
         description=(
-            "Where all heliostats aim [m]; by default the receiver's middle, which is the axis of a"
-            " whole cylinder and the middle of a cavity's opening."
+            "Where all heliostats aim [m]; by default the receiver's middle, which is the middle of"
+            " a cavity's opening, and on a cylinder the point that faces each heliostat."
         ),
     )
     aim_points_m: dict[Name, Position] = Field(
@@ -120,18 +119,16 @@ class FleetIn(Model):
             around,
         )
 
-    def _around(self, session: Session) -> dict[str, np.ndarray[Any, Any]]:
-        """Where heliostats aim (3,) [m] that the layout gives to another receiver, by name.
+    def _around(self, session: Session) -> dict[str, Receiver]:
+        """Other receivers that the layout gives to heliostats, by the heliostats' names.
 
         There are none if heliostats are named, or what they light is not of the layout.
         """
         given = {} if self.heliostats is not None else store.receivers_of_heliostats(session)
         if self.target not in given.values():
             return {}
-        aims = {
-            goal: store.get_target_or_receiver(session, goal).aim for goal in set(given.values())
-        }
-        return {name: aims[goal] for name, goal in given.items() if goal != self.target}
+        goals = {goal: store.get_target_or_receiver(session, goal) for goal in set(given.values())}
+        return {name: goals[goal] for name, goal in given.items() if goal != self.target}
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +145,7 @@ class Fleet:
     aims: Mapping[str, Sequence[float]]
     tower: Tower | None
     altitude: float
-    around: Mapping[str, NDArray[np.float64]]
+    around: Mapping[str, Receiver]
 
     def under(self, sun: Sun, ideal: bool) -> HeliostatGroup:
         """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
@@ -158,7 +155,7 @@ class Fleet:
             receiver=self.receiver,
             sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
             model=self.model.with_dni(dni_of(sunlight, sun.elevation_deg, self.altitude)),
-            aim=np.array(self.receiver.aim if aim is None else aim),
+            aim=None if aim is None else np.array(aim),
             aims=self.aims,
             ideal=ideal,
             tower=self.tower,

@@ -17,7 +17,6 @@ from model.errors import InvalidInputError
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.text import ForeignLine, read_lines
-from service.sources.plant_receivers import aim_of
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
 
 Array = NDArray[np.float64]
@@ -169,7 +168,7 @@ def solarpilot_layout(described: PlantDescription, aims: Mapping[str, Array]) ->
     lines = []
     for name, heliostat in described.plant.heliostats.items():
         receiver = goals[described.receiver_of[name]]
-        aim = aims.get(name, aim_of(receiver, heliostat.position))
+        aim = aims.get(name, receiver.aim_of(heliostat.position))
         numbers = [template[described.type_of[name]], *(f"{x:.6f}" for x in heliostat.position)]
         cells = [*numbers, *[_NULL] * 5, *(f"{x:.6f}" for x in aim)]
         lines.append(",".join(map(str, cells)))

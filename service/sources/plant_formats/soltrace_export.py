@@ -18,7 +18,7 @@ from model.plant import Cylinder, Facet, TargetPlane
 from model.receivers import Panels
 from model.sunshape import SOLAR_DISC, Gaussian, Pillbox, SunShape
 from service.sources.plant_file import PlantDescription
-from service.sources.plant_receivers import AnyReceiver, aim_of
+from service.sources.plant_receivers import AnyReceiver
 from service.sources.plant_schema import UP
 
 Array = NDArray[np.float64]
@@ -122,7 +122,7 @@ def _poses(described: PlantDescription, sun: Array, aims: Mapping[str, Array]) -
     heliostats = described.plant.heliostats
     feet = np.array([heliostat.position for heliostat in heliostats.values()])
     points = [
-        aims.get(name, aim_of(goals[described.receiver_of[name]], foot))
+        aims.get(name, goals[described.receiver_of[name]].aim_of(foot))
         for name, foot in zip(heliostats, feet, strict=True)
     ]
     mounts = Mount.stack([heliostat.mount for heliostat in heliostats.values()])

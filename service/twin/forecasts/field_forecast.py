@@ -54,11 +54,11 @@ class HeliostatGroup:
     sun : (3,)
         Unit vector towards the recorded sun.
     model : ModelVersion
-    aim : (3,) [m]
-        Aim point of all heliostats that are not in ``aims``.
+    aim : (3,) [m] or None
+        Aim point of all heliostats that are not in ``aims``; None for the receiver's default.
     aims : mapping of heliostat names to (3,) [m]
-    around : mapping of heliostat names to (3,) [m]
-        Heliostats that light another receiver, and where they aim: they block and shade.
+    around : mapping of heliostat names to receivers or (3,) [m]
+        Heliostats that send no light, and where they aim: they block and shade.
     ideal : bool
         Trace ideal surfaces instead of the active ones.
     tower : Tower or None
@@ -73,18 +73,23 @@ class HeliostatGroup:
     receiver: Receiver
     sun: Array
     model: ModelVersion
-    aim: Array
+    aim: Array | None
     aims: Mapping[str, Sequence[float]]
     ideal: bool
     tower: Tower | None = None
-    around: Mapping[str, Array] = field(default_factory=dict)
+    around: Mapping[str, Receiver | Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     without_surface: set[str] = field(default_factory=set)
 
-    def aim_of(self, name: str) -> Array:
+    def aim_of(self, heliostat: Heliostat) -> Array:
         """Aim point of a heliostat (3,) [m]."""
+        name = heliostat.name
         aim = self.around[name] if name in self.around else self.aims.get(name, self.aim)
-        return np.asarray(aim, dtype=np.float64)
+        if aim is None:
+            aim = self.receiver
+        if isinstance(aim, Sequence | np.ndarray):
+            return np.asarray(aim, dtype=np.float64)
+        return aim.aim_of(heliostat.position)
 
 
 def group_warnings(ideal: int, heliostats: int) -> list[str]:
@@ -292,7 +297,7 @@ def _neighbours(
             with runtime.database.reading() as session:
                 batch = _Batch.read(session, names)
             for heliostat in _heliostats(fleet, batch):
-                yield heliostat, fleet.aim_of(heliostat.name)
+                yield heliostat, fleet.aim_of(heliostat)
 
     return aligned_field(all_of_them(), fleet.sun, fleet.model)
 
@@ -338,6 +343,6 @@ def _setups(fleet: HeliostatGroup, batch: _Batch, heights: Mapping[str, Array]) 
             points,
             fleet.sun,
             fleet.receiver.middle,
-            aim=fleet.aim_of(name),
+            aim=fleet.aim_of(heliostat),
             identifier=name,
         )

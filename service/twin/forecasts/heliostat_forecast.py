@@ -42,7 +42,7 @@ class ForecastRequest:
 
     Names are those of `POST /v1/forecasts`. ``receiver`` is the geometry to light. Without it
     ``target`` names a stored target or receiver. ``sun_at`` is the time that was requested, if any.
-    ``aim_point_m`` (3,) is by default the receiver's `model.plant.Receiver.aim`.
+    ``aim_point_m`` (3,) is by default the receiver's `model.plant.Receiver.aim_of`.
 
     ``motor_position`` [steps] may replace ``aim_point_m``. It turns the mirror by its calibrated
     mount at ``sun_at``, by default as newly measured.
@@ -220,8 +220,7 @@ def trace_flux(
     """
     receiver, angles = request.receiver, None
     assert receiver is not None
-    # A setup's own default is the middle of its plane.
-    aim = None if isinstance(receiver, TargetPlane) else receiver.aim
+    aim = request.aim_point_m or receiver.aim_of(twin.heliostat.position)
     if request.motor_position is not None:
         twin.heliostat.mount.require_within(np.asarray(request.motor_position))
         angles = twin.heliostat.mount.angles_from_motors(request.motor_position)
@@ -231,7 +230,7 @@ def trace_flux(
         sun_direction(request.sun.azimuth_deg, request.sun.elevation_deg),
         receiver.middle,
         angles=angles,
-        aim=aim if request.aim_point_m is None else np.asarray(request.aim_point_m),
+        aim=np.asarray(aim),
         degree=degree,
         identifier=twin.heliostat.name,
         taken_at=request.sun_at,

@@ -59,6 +59,7 @@ class LightWatts(TypedDict):
     shading: float
     blocking: float
     reflectance: float
+    cleanliness: float
     attenuation: float
     intercept: float
     absorptance: float
@@ -84,6 +85,7 @@ def light_watts(losses: Losses, dni_w_m2: float) -> LightWatts:
         shading=losses.shading,
         blocking=losses.blocking,
         reflectance=losses.reflectance,
+        cleanliness=losses.cleanliness,
         attenuation=losses.attenuation,
         intercept=losses.intercept,
         absorptance=losses.absorptance,
@@ -133,6 +135,7 @@ def loss_chain(watts: Mapping[str, Any]) -> list[LossStage]:
     incident = watts["incident_w"]
     stages, left = [LossStage("on the mirrors' area", None, None, incident, 1.0)], incident
     for name in LOSSES:
-        before, left = left, left * watts[name]
-        stages.append(LossStage(name, watts[name], before - left, left, left / incident))
+        factor = watts.get(name, 1.0)  # forecasts of before November 2026 have no cleanliness
+        before, left = left, left * factor
+        stages.append(LossStage(name, factor, before - left, left, left / incident))
     return stages

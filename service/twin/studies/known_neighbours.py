@@ -18,7 +18,6 @@ from model.plant_model import PlantModel
 from model.study import FluxImage
 from service import store
 from service.base.errors import SKIPPED
-from service.sources.plant_receivers import aim_of
 from service.store.pointing import mounts
 from service.twin.heliostats.measurements import HeliostatContext
 from service.twin.heliostats.stored_mount import as_calibrated
@@ -55,7 +54,7 @@ def load_neighbours(session: Session, twin: HeliostatContext) -> list[Neighbour]
         except SKIPPED:  # it cannot be placed; forecasts of the field name it
             continue
         receiver = receivers.get(given.get(row.name, ""), next(iter(receivers.values())))
-        found.append(Neighbour(heliostat, aim_of(receiver, heliostat.position)))
+        found.append(Neighbour(heliostat, receiver.aim_of(heliostat.position)))
     return found
 
 

@@ -183,6 +183,7 @@ class ForecastLosses(BaseModel):
     shading: float = _factor("Share that is not shaded")
     blocking: float = _factor("Share that is not blocked")
     reflectance: float = _factor("Reflectance of mirrors and of the model's optics")
+    cleanliness: float = Field(1.0, description="Share that soiling leaves; here 1 [1].")
     attenuation: float = _factor("Share that the air leaves")
     intercept: float = _factor("Share that hits the whole target or receiver, mapped or not")
     absorptance: float = _factor("Share that it absorbs")

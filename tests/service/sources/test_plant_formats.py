@@ -15,7 +15,6 @@ from service.drawing.plant_picture import surface_lines
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.formats import foreign_text, read_foreign
 from service.sources.plant_formats.soltrace import SolTraceInput, parse_soltrace, read_soltrace
-from service.sources.plant_receivers import aim_of
 from tests.service.command import ends, heliotwin
 from tests.service.sources.plant_files import ps10, published, round_c, write_plant
 
@@ -100,7 +99,7 @@ def test_receiver_is_where_the_aim_points_are(tmp_path: Path):
     plant = read_plant(imported.write(tmp_path)[0])
     for name, aim in imported.aims.items():
         foot = plant.plant.heliostats[name].position
-        assert np.linalg.norm(aim_of(plant.receivers["main"], foot) - aim) < 0.02
+        assert np.linalg.norm(plant.receivers["main"].aim_of(foot) - aim) < 0.02
 
 
 def test_mirrors_of_opencsp(tmp_path: Path):
@@ -181,7 +180,7 @@ def test_a_cavity_is_read_as_nothing_else(tmp_path: Path):
     cavity = plant.receivers["cavity"]
     assert isinstance(cavity, Cavity)
     assert not isinstance(cavity, Panels)
-    np.testing.assert_allclose(aim_of(cavity, np.zeros(3)), cavity.aperture.mean(axis=0))
+    np.testing.assert_allclose(cavity.aim_of(np.zeros(3)), cavity.aperture.mean(axis=0))
     assert len(surface_lines(cavity)) == 1 + len(cavity.panels)
     with pytest.raises(InvalidInputError, match="a cavity is not written for SolTrace"):
         foreign_text(plant, "soltrace", (180.0, 50.0), {})

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import solarpilot
+from service.base.progress import no_progress
+from service.cli.field import FieldRequest, trace_field
 
 pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 'peers'")
 
@@ -18,3 +20,6 @@ def test_efficiency_is_solarpilots(tmp_path: Path):
     azimuth, zenith, efficiency = min(theirs.efficiencies, key=lambda row: row[1])
     ours = solarpilot.our_efficiency(plant, azimuth + 180, 90 - zenith)
     assert ours == pytest.approx(efficiency, abs=0.01)
+    # Aims at the axis meet the surface below its middle: 0.95 of the light lands.
+    request = FieldRequest("main", (azimuth + 180) % 360, 90 - zenith, 1000.0)
+    assert trace_field(plant, request, no_progress).report["field"]["intercept"] > 0.99

@@ -59,7 +59,8 @@ def test_field_forecast_has_the_watts_of_the_plant_file(
     result = done(rich, "forecasts", body | {"dni_w_m2": "clear_sky"})["result"]
     receiver = plant.receivers[name]
     names = {item["name"] for item in rich.get("/v1/heliostats").json()["items"]}
-    aims = dict.fromkeys(names, receiver.aim)
+    feet = {one: heliostat.position for one, heliostat in plant.plant.heliostats.items()}
+    aims = {one: receiver.aim_of(feet[one]) for one in names}
     request = FieldRequest(name, 150.0, 35.0, aims=aims, resolution=(48, 96))
     report = trace_field(plant, request, lambda _: None).report
     assert result["dni_w_m2"] == pytest.approx(report["dni_w_m2"])

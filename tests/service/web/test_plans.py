@@ -276,7 +276,7 @@ def test_load_is_what_lands_and_what_is_too_much():
     reflect.
     """
     plane = TargetPlane("wall", np.zeros(3), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 2.0, 2.0)
-    losses = {"AA39": Losses(10.0, 0.8, 1.0, 1.0, 1.0, 1.0, 0.5, 0.9)}
+    losses = {"AA39": Losses(10.0, 0.8, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.9)}
     image = np.array([[3.0, 1.0], [0.0, 0.0]])
     load = load_of(FleetFlux(image, power=8.0, heliostats=1, losses=losses), plane, 2.0, 1.0)
     assert (load["power_w"], load["intercept"], load["spillage"], load["exceeded_m2"]) == (
