@@ -186,6 +186,8 @@ def plan_aims(
         plan, deviations = ascent.plan, ascent.deviations
         linear = linear_draws(plan)
         second_order = _second_order(plan, linear)
+        if linear.ratio + second_order <= 1:
+            second_order = _second_order(plan, linear, _CONFIRMING_DRAWS)
         excess = linear.ratio + second_order - 1
         if excess <= 0:
             break
@@ -207,16 +209,22 @@ def _on_blocks(plan: AimPlan, thin: Thinned) -> AimPlan:
     return replace(plan, kernels=thin.kernels, limit=limit, multipliers=multipliers)
 
 
-def _second_order(plan: AimPlan, linear: "LinearDraws | None" = None) -> float:
-    """What `Draws.ratio` is above that of `linear_draws`, by tracing the draws of the largest."""
+def _second_order(
+    plan: AimPlan, linear: "LinearDraws | None" = None, draws: int | None = None
+) -> float:
+    """What `Draws.ratio` is above that of `linear_draws`, by tracing the largest ``draws``."""
     linear = linear or linear_draws(plan)
-    rows = np.argsort(-linear.ratios)[: _FULL_DRAWS * _ease(plan.kernels)].tolist()
+    count = (draws or _FULL_DRAWS) * _ease(plan.kernels)
+    rows = np.argsort(-linear.ratios)[:count].tolist()
     ratios = linear.ratios.copy()
     ratios[rows] = plan.draws(rows=rows).ratios
     return float(np.quantile(ratios, WITHIN)) - linear.ratio
 
 
-_FULL_DRAWS = 12
+_FULL_DRAWS, _CONFIRMING_DRAWS = 12, 48
+"""Draws that are traced for a step, and before a plan counts as within its limit. Draws that are
+not among the first to first order may be among them in truth.
+"""
 
 
 def _ease(kernels: Kernels) -> int:

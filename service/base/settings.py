@@ -431,6 +431,9 @@ class AlarmSettings(_SettingsGroup):
     alarm_light_loss: float = Field(0.2, gt=0, lt=1)
     """The same for the share of light that its newest photographs have lost, compared with other
     heliostats on the same days [1]."""
+    default_pointing_error_mrad: float = Field(0.5, ge=0, lt=100)
+    """Pointing error in forecasts of the field, plans and aims of a heliostat whose photographs and
+    properties give none: standard deviation of its beam per axis [mrad]."""
     alarm_pointing_mrad: float = Field(3.0, gt=0, le=1000)
     """Pointing error above which a heliostat has an alarm [mrad]."""
     alarm_moved_days: Days = 90.0

@@ -40,6 +40,7 @@ class AimReport(AimFigures):
     power_interval_w: list[float]
     peak_interval_w_m2: list[float]
     surface_draws: int
+    sources: dict[str, dict[str, int]]
     skipped: dict[str, str]
 
 
@@ -96,6 +97,7 @@ def find_aims(
         power_interval_w=[moment.power.low, moment.power.high],
         peak_interval_w_m2=[moment.peak.low, moment.peak.high],
         surface_draws=len(worlds),
+        sources=single.report["sources"],
         skipped=found.skipped,
     )
     return Aims(plan, report)

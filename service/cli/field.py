@@ -22,6 +22,14 @@ from model.surface import DEGREE, control_points
 from service.base.progress import Progress
 from service.sources.folder import read_surface
 from service.sources.plant_file import PlantDescription
+from service.twin.forecasts.mirror_states import (
+    AS_DECLARED,
+    MirrorState,
+    MirrorStates,
+    count_sources,
+    in_state,
+    with_measured,
+)
 from service.twin.forecasts.watts import FieldWatts, clear_sky_dni, field_watts, heliostat_watts
 
 Array = NDArray[np.float64]
@@ -54,6 +62,8 @@ class FieldRequest:
     surfaces : Path or None
         Folder of surfaces; None for the nominal mirrors.
     resolution : (rows, columns), or None
+    states : MirrorStates
+        Measured states of mirrors; the others are as declared.
     """
 
     receiver: str
@@ -63,6 +73,7 @@ class FieldRequest:
     aims: dict[str, Array | None] | None = None
     surfaces: Path | None = None
     resolution: Resolution | None = None
+    states: MirrorStates = AS_DECLARED
 
 
 class FieldReport(TypedDict):
@@ -73,6 +84,8 @@ class FieldReport(TypedDict):
     receiver: str
     field: FieldWatts
     by_heliostat: dict[str, dict[str, float]]
+    sources: dict[str, dict[str, int]]
+    states: dict[str, MirrorState]
     skipped: dict[str, str]
     warnings: list[str]
 
@@ -113,6 +126,7 @@ class Aimed:
     setups: list[Setup] = field(default_factory=list)
     others: list[tuple[Heliostat, Array]] = field(default_factory=list)
     without_surface: int = 0
+    states: dict[str, MirrorState] = field(default_factory=dict)
 
 
 def trace_field(plant: PlantDescription, request: FieldRequest, step: Progress) -> FieldFlux:
@@ -193,6 +207,8 @@ def _aimed(plant: PlantDescription, receiver: Receiver, request: FieldRequest, s
             aim = receiver.aim_of(heliostat.position)
         surface = None if request.surfaces is None else read_surface(request.surfaces, heliostat)
         found.without_surface += surface is None and request.surfaces is not None
+        state = found.states[name] = request.states.of(heliostat)
+        heliostat = in_state(heliostat, state)
         points, degree = (control_points(heliostat), DEGREE) if surface is None else surface
         found.setups.append(
             Setup(heliostat, points, sun, receiver.middle, aim=aim, degree=degree, identifier=name)
@@ -220,12 +236,15 @@ def _report(
             f"{aimed.without_surface} of {len(aimed.setups)} heliostats have no surface in"
             f" {request.surfaces} and are traced as nominal mirrors"
         )
+    states = {name: aimed.states[name] for name in total.losses}
     return FieldReport(
         sun={"azimuth_deg": request.azimuth_deg, "elevation_deg": request.elevation_deg},
         dni_w_m2=dni,
         receiver=receiver.name,
         field=field_watts(total, dni),
         by_heliostat=heliostat_watts(total.losses, dni),
+        sources=count_sources(states.values()),
+        states=with_measured(states),
         skipped=total.skipped,
         warnings=warnings,
     )

@@ -171,6 +171,19 @@ def test_on_a_part_of_a_cylinder_mirrors_aim_at_the_middle_of_what_they_see(
     assert np.cross(out, aim)[2] / part.radius == pytest.approx(np.mean(across), abs=1e-9)
 
 
+@pytest.mark.parametrize("receiver", RECEIVERS, ids=lambda one: one.name)
+def test_cleanliness_takes_its_share_of_the_light(receiver: Receiver):
+    clean, soiled = (
+        flux_of(receiver),
+        flux_of(receiver, mirror_type(optics=replace(MIRROR, cleanliness=0.6))),
+    )
+    np.testing.assert_allclose(soiled.irradiance, 0.6 * clean.irradiance, rtol=1e-4, atol=1.0)
+    for before, after in zip(clean.losses.values(), soiled.losses.values(), strict=True):
+        assert (before.cleanliness, after.reflectance) == (1, before.reflectance)
+        assert after.cleanliness == pytest.approx(0.6)
+        assert after.efficiency == pytest.approx(0.6 * before.efficiency, rel=1e-4)
+
+
 def test_cosine_and_attenuation_are_those_of_geometry():
     found = flux_of(BOARD, mirror_type(canting=Canting("flat")), [(20.0, 300.0, 0.0)])
     middle, sun = np.array([20.0, 300.0, 3.0]), sun_direction(150.0, 25.0)

@@ -34,6 +34,13 @@ SurfacesOf = Annotated[
     Path | None,
     typer.Option(help="Folder that predict wrote; nominal mirrors if not given.", metavar="DIR"),
 ]
+StatesOf = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV of measured dimming and pointing errors; as declared if not given.",
+        metavar="STATES.csv",
+    ),
+]
 MapResolution = Annotated[
     tuple[int, int] | None,
     typer.Option(min=2, max=1024, help="Rows and columns of the map.", metavar="ROWS COLUMNS"),
@@ -56,6 +63,7 @@ def field(
         ),
     ] = None,
     surfaces: SurfacesOf = None,
+    states: StatesOf = None,
     resolution: MapResolution = None,
     as_json: AsJson = False,
 ) -> None:
@@ -70,6 +78,7 @@ def field(
     from service.cli.times import moment_of
     from service.sources.plant_file import read_plant
     from service.sources.plant_tables import read_aims
+    from service.twin.forecasts.mirror_states import AS_DECLARED, read_states
 
     require_folder(out)
     source = read_plant(plant)
@@ -82,6 +91,7 @@ def field(
         None if aims is None else read_aims(aims, source.plant.heliostats),
         surfaces,
         resolution,
+        AS_DECLARED if states is None else read_states(states, source.plant.heliostats),
     )
     with progress(None, "field") as step:
         found = trace_field(source, request, step)
@@ -122,6 +132,7 @@ def aim(
         ),
     ] = None,
     surfaces: SurfacesOf = None,
+    states: StatesOf = None,
     resolution: MapResolution = None,
     as_json: AsJson = False,
 ) -> None:
@@ -137,6 +148,7 @@ def aim(
     from service.sources.limits import read_limit
     from service.sources.plant_file import read_plant
     from service.sources.plant_tables import read_aims
+    from service.twin.forecasts.mirror_states import AS_DECLARED, read_states
 
     require_file(out)
     require_file(report)
@@ -144,7 +156,13 @@ def aim(
     source = read_plant(plant)
     azimuth, elevation = sun_of(source, sun, moment_of(at))
     request = FieldRequest(
-        receiver, azimuth, elevation, dni, surfaces=surfaces, resolution=resolution
+        receiver,
+        azimuth,
+        elevation,
+        dni,
+        surfaces=surfaces,
+        resolution=resolution,
+        states=AS_DECLARED if states is None else read_states(states, source.plant.heliostats),
     )
     begin = None if start is None else read_aims(start, source.plant.heliostats)
     with progress(None, "aim") as step:

@@ -380,6 +380,7 @@ class _Planner:
             "sun": sun.model_dump(),
             "dni_w_m2": dni,
             "heliostats": len(kernels),
+            "sources": images.sources,
             "seconds": {
                 "images": round(traced - begun, 3),
                 "aims": round(aimed - traced, 3),
@@ -408,7 +409,8 @@ class _Planner:
             )
             return_memory()
             require_some(single.heliostats, single.skipped)
-            return TracedImages(kernels, single, group.skipped, frozenset(group.without_surface))
+            without, sources = frozenset(group.without_surface), group.sources(group.skipped)
+            return TracedImages(kernels, single, group.skipped, without, sources)
 
         with runtime.database.reading() as session:
             sources = sources_of(session, [*group.names, *group.around], group.model.number)

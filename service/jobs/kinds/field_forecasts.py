@@ -1,6 +1,6 @@
 """The job `forecasts`: the flux of many heliostats on one receiver."""
 
-import json
+import pickle
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field
@@ -30,6 +30,7 @@ from service.base.receivers import ReceiverIn
 from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.store.jobs import queue
+from service.twin.alarms.measured_states import read_mirror_states
 from service.twin.forecasts.field_forecast import (
     Checkpoint,
     HeliostatGroup,
@@ -37,6 +38,7 @@ from service.twin.forecasts.field_forecast import (
     group_warnings,
 )
 from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
+from service.twin.forecasts.mirror_states import MirrorStates, with_measured
 from service.twin.forecasts.watts import Sunlight, dni_of, field_watts, heliostat_watts
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
@@ -80,6 +82,13 @@ class FleetIn(Model):
             " shades them."
         ),
     )
+    measured_states: Flag = Field(
+        default=True,
+        description=(
+            "Whether mirrors are as photographs measured them: dimmed, and with their pointing"
+            " errors. Otherwise, and with ideal surfaces, they are as declared."
+        ),
+    )
     dni_w_m2: Sunlight = 1000.0
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
@@ -108,15 +117,17 @@ class FleetIn(Model):
             tower = store.stored_tower(session)
             altitude = store.get_plant(session).altitude_m
             around = self._around(session)
+        lit = [name for name in names if name not in around]
         return Fleet(
             self,
-            [name for name in names if name not in around],
+            lit,
             receiver,
             model,
             self.aim_points_m,
             tower,
             altitude,
             around,
+            read_mirror_states(runtime, lit) if self.measured_states else None,
         )
 
     def _around(self, session: Session) -> dict[str, Receiver]:
@@ -146,6 +157,7 @@ class Fleet:
     tower: Tower | None
     altitude: float
     around: Mapping[str, Receiver]
+    states: MirrorStates | None
 
     def under(self, sun: Sun, ideal: bool) -> HeliostatGroup:
         """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
@@ -160,6 +172,7 @@ class Fleet:
             ideal=ideal,
             tower=self.tower,
             around=self.around,
+            states=None if ideal else self.states,
         )
 
 
@@ -211,17 +224,18 @@ def forecast_field(context: Context, payload: FleetForecastIn) -> Result:
     dni = fleet.model.optics.dni
     figures |= {"sun": sun.model_dump(), "dni_w_m2": dni, "field": field_watts(total, dni)}
     figures |= {"heliostats": total.heliostats, "skipped": total.skipped}
-    figures |= {"ideal_surfaces": ideal}
+    figures |= {"ideal_surfaces": ideal, "sources": fleet.sources(total.skipped)}
     saved.drop()
-    details = {"by_heliostat": heliostat_watts(total.losses, dni)}
+    details: dict[str, object] = {"by_heliostat": heliostat_watts(total.losses, dni)}
+    details["states"] = with_measured(fleet.traced_states)
     with context.runtime.database.writing() as session:
         context.replace(session, _DETAILS, details)
     return Result(figures, {"flux": total.irradiance.astype(np.float32)})
 
 
 def _fingerprint(fleet: HeliostatGroup) -> str:
-    """Fingerprint of the heliostats and the model. A checkpoint is valid only for the same one."""
-    return sha256(json.dumps([*fleet.names, fleet.model.version]).encode()).hexdigest()
+    """Fingerprint of heliostats, their states and the model, for which a checkpoint is valid."""
+    return sha256(pickle.dumps((fleet.names, fleet.model.version, fleet.states))).hexdigest()
 
 
 @dataclass(eq=False)

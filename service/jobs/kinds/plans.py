@@ -247,7 +247,7 @@ def _plan_time(time: _Time) -> None:
     fleet = time.fleet(ideal=False)
     twin = time.light(fleet, 0.0)
     require_some(twin.heliostats, twin.skipped)
-    without = fleet.without_surface - set(twin.skipped)
+    without, sources = fleet.without_surface - set(twin.skipped), fleet.sources(twin.skipped)
     fleet = time.fleet(ideal=True)
     ideal = time.light(
         replace(fleet, names=[name for name in fleet.names if name not in twin.skipped]), 0.5
@@ -271,6 +271,7 @@ def _plan_time(time: _Time) -> None:
     about = {
         "skipped": known["skipped"] | twin.skipped,
         "ideal_surfaces": sorted(without.union(known["ideal_surfaces"])),
+        "sources": sources,
     }
     with context.runtime.database.writing() as session:
         context.keep(session, map_name(time.index), step, maps)

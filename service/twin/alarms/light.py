@@ -34,8 +34,8 @@ class LostLight:
     target : str
     since : datetime
         Of the first photograph with less light.
-    share, min_share : float [1]
-        Lost share of the light, and the lower end of its 95 % interval.
+    share, min_share, max_share : float [1]
+        Lost share of the light, and the ends of its 95 % interval.
     photographs : int
         With less light.
     """
@@ -45,6 +45,7 @@ class LostLight:
     since: datetime
     share: float
     min_share: float
+    max_share: float
     photographs: int
 
 
@@ -106,5 +107,7 @@ def _lost(
         return None
     half = (drop.earlier + drop.recent) / 2
     count = next((place for place, value in enumerate(values) if value > half), len(values))
-    share, least = (-math.expm1(-size) for size in (drop.earlier - drop.recent, drop.low))
-    return LostLight(heliostat, target, dated[max(count, 1) - 1][0], share, least, max(count, 1))
+    sizes = drop.earlier - drop.recent, drop.low, drop.high
+    share, least, most = (-math.expm1(-size) for size in sizes)
+    count = max(count, 1)
+    return LostLight(heliostat, target, dated[count - 1][0], share, least, most, count)

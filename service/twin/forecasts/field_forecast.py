@@ -1,7 +1,7 @@
 """Flux forecasts of many heliostats, tile by tile, for one sun and one receiver."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,6 +32,7 @@ from service.base.memory import return_memory
 from service.base.progress import Report
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow
+from service.twin.forecasts.mirror_states import MirrorState, MirrorStates, count_sources, in_state
 from service.twin.heliostats.stored_mount import as_calibrated
 from service.twin.plant.model_versions import ModelVersion
 from service.twin.runtime.engines import Threads, engine_of
@@ -63,10 +64,14 @@ class HeliostatGroup:
         Trace ideal surfaces instead of the active ones.
     tower : Tower or None
         It shades mirrors.
+    states : MirrorStates or None
+        Measured states in which mirrors are traced; None for mirrors as declared.
     skipped : dict
         Heliostats that could not be read, with the reason. The forecast fills it.
     without_surface : set of str
         Heliostats without a surface, which are traced as ideal mirrors. The forecast fills it.
+    traced_states : dict
+        States in which mirrors are traced, by heliostat. The forecast fills it.
     """
 
     names: Sequence[str]
@@ -77,9 +82,11 @@ class HeliostatGroup:
     aims: Mapping[str, Sequence[float]]
     ideal: bool
     tower: Tower | None = None
+    states: MirrorStates | None = None
     around: Mapping[str, Receiver | Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     without_surface: set[str] = field(default_factory=set)
+    traced_states: dict[str, MirrorState] = field(default_factory=dict)
 
     def aim_of(self, heliostat: Heliostat) -> Array:
         """Aim point of a heliostat (3,) [m]."""
@@ -90,6 +97,11 @@ class HeliostatGroup:
         if isinstance(aim, Sequence | np.ndarray):
             return np.asarray(aim, dtype=np.float64)
         return aim.aim_of(heliostat.position)
+
+    def sources(self, skipped: Container[str] = ()) -> dict[str, dict[str, int]]:
+        """How many values of traced mirrors are measured, declared and defaults."""
+        kept = (state for name, state in self.traced_states.items() if name not in skipped)
+        return count_sources(kept)
 
 
 def group_warnings(ideal: int, heliostats: int) -> list[str]:
@@ -209,13 +221,14 @@ def trace_kernels(
 class TracedImages:
     """Images of a group's mirrors, and the flux of the same group without a plan.
 
-    ``skipped`` and ``without_surface`` are those of `HeliostatGroup`.
+    ``skipped``, ``without_surface`` and ``sources`` are those of `HeliostatGroup`.
     """
 
     kernels: Kernels
     single_aim: FleetFlux
     skipped: Mapping[str, str]
     without_surface: frozenset[str]
+    sources: Mapping[str, Mapping[str, int]]
 
     @property
     def nbytes(self) -> int:
@@ -269,7 +282,11 @@ def _heliostats(fleet: HeliostatGroup, batch: _Batch) -> Iterator[Heliostat]:
             fleet.skipped[name] = f"there is no heliostat {name}; POST it to /v1/heliostats first"
             continue
         try:
-            yield as_calibrated(batch.rows[name], batch.mounts.get(name), fleet.model)
+            heliostat = as_calibrated(batch.rows[name], batch.mounts.get(name), fleet.model)
+            if fleet.states is not None and name not in fleet.around:
+                state = fleet.traced_states[name] = fleet.states.of(heliostat)
+                heliostat = in_state(heliostat, state)
+            yield heliostat
         except ModelError as error:
             fleet.skipped[name] = str(error)
 

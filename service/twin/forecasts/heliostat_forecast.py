@@ -220,7 +220,7 @@ def trace_flux(
     """
     receiver, angles = request.receiver, None
     assert receiver is not None
-    aim = request.aim_point_m or receiver.aim_of(twin.heliostat.position)
+    aim = None if isinstance(receiver, TargetPlane) else receiver.aim_of(twin.heliostat.position)
     if request.motor_position is not None:
         twin.heliostat.mount.require_within(np.asarray(request.motor_position))
         angles = twin.heliostat.mount.angles_from_motors(request.motor_position)
@@ -230,7 +230,7 @@ def trace_flux(
         sun_direction(request.sun.azimuth_deg, request.sun.elevation_deg),
         receiver.middle,
         angles=angles,
-        aim=np.asarray(aim),
+        aim=aim if request.aim_point_m is None else np.asarray(request.aim_point_m),
         degree=degree,
         identifier=twin.heliostat.name,
         taken_at=request.sun_at,

@@ -19,6 +19,7 @@ from service.jobs.kind import Kinds, result_of
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.sizes import sizes
+from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
 from service.twin.forecasts.watts import loss_chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
@@ -95,6 +96,7 @@ def _plain(value: Any) -> bool:
 _LABELS = {
     "dni_w_m2": "direct normal irradiance",
     "neighbours": "mirrors shade and block each other",
+    "measured_states": "mirrors as measured: dimmed, and with their pointing errors",
     "model_version": "version of the model",
     "aim_point_m": "aim point, east, north, up [m]",
     "aim_points_m": "aim points, east, north, up [m]",
@@ -162,6 +164,13 @@ def get_job_heliostats_table(number: Number, runtime: RuntimeDep, kinds: KindsDe
     return sheet_answer(f"job-{number}-heliostats", ("heliostat", *columns), rows)
 
 
+@router.get("/jobs/{number}/states.csv", dependencies=[READ])
+def get_job_states_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -> Response:
+    """Measured states of mirrors of a field forecast, for ``heliotwin field --states``."""
+    rows = state_rows(_result_with(runtime, kinds, number, "states")["states"])
+    return sheet_answer(f"job-{number}-states", STATE_COLUMNS, rows)
+
+
 def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
     """The first heliostats of a field forecast, sorted by a factor or their name."""
     lines = list(result.get("by_heliostat", {}).items())
@@ -209,6 +218,7 @@ def get_job_page(
         has_changed=any(result.values()),
         chain=loss_chain(result["field"]) if result.get("field") else [],
         mirrors=_mirrors(result, by),
+        n_measured=len(result.get("states", ())),
         n_mirrors=len(result.get("by_heliostat", ())),
         factors=_FACTORS,
         by=by,

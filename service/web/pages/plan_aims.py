@@ -43,6 +43,7 @@ def aims_for(
         plane=asked.plane,
         receiver=asked.receiver,
         neighbours=asked.neighbours,
+        measured_states=asked.measured_states,
         dni_w_m2=asked.dni_w_m2,
         model_version=asked.model_version,
         day=day,

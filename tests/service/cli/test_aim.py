@@ -82,6 +82,35 @@ def test_aims_give_what_their_report_says(
     assert traced["peak_w_m2"] == pytest.approx(report["peak_w_m2"], rel=0.02)
 
 
+def test_measured_states_act_in_fields_and_aims(plant: Path, tmp_path: Path):
+    """A soiled mirror has its share of the light, and one that points badly spills."""
+    names = list(read_plant(plant).plant.heliostats)
+    soiled, off = names[3], names[7]
+    states = tmp_path / "states.csv"
+    states.write_text(
+        "name,cleanliness,cleanliness_low,cleanliness_high,pointing_error_mrad\n"
+        f"{soiled},0.55,0.5,0.6,\n{off},,,,12\n"
+    )
+    given = ("--states", states)
+    before = field(plant, tmp_path, "main", "--resolution", 32, 80)
+    after = field(plant, tmp_path, "main", "--resolution", 32, 80, *given)
+    assert before["cleanliness"] == pytest.approx(1)
+    assert after["cleanliness"] == pytest.approx(1 - 0.45 / len(names), abs=2e-3)
+    report = json.loads((tmp_path / "field" / "field.json").read_text())
+    light = report["by_heliostat"]
+    assert light[soiled]["cleanliness"] == pytest.approx(0.55)
+    assert light[off]["intercept"] < 0.95 < before["intercept"]
+    assert report["sources"]["cleanliness"] == {"declared": len(names) - 1, "measured": 1}
+    assert report["states"][soiled]["cleanliness"]["ci95"] == [0.5, 0.6]
+    assert set(report["states"]) == {soiled, off}
+    plain, known = (
+        aimed(plant, tmp_path, "main", 400, "--resolution", 24, 60, *some) for some in ((), given)
+    )
+    assert known["sources"]["pointing_error_mrad"] == {"declared": len(names) - 1, "measured": 1}
+    assert known["single_aim_power_w"] < 0.993 * plain["single_aim_power_w"]
+    assert known["power_w"] < 0.995 * plain["power_w"]
+
+
 def test_light_enters_a_cavity_and_its_panels_stay_under_the_limit(plant: Path, tmp_path: Path):
     single = field(plant, tmp_path, "cave", "--resolution", 24, 30)
     limit = 0.8 * single["peak_w_m2"] / 1e3

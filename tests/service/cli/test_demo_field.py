@@ -72,6 +72,40 @@ def test_the_card_of_a_heliostat_ranks_its_fault(client: TestClient, kind: str, 
     assert "study 1 of its photographs" in model
 
 
+def result_of(client: TestClient, kind: str) -> dict[str, Any]:
+    """The result of the only job of a kind."""
+    (job,) = client.get("/v1/jobs", params={"kind": kind}).json()["items"]
+    result: dict[str, Any] = client.get(f"/v1/jobs/{job['id']}").json()["result"]
+    return result
+
+
+@pytest.mark.full
+def test_forecasts_and_aims_know_the_soiled_mirror_and_the_drives_that_stepped(client: TestClient):
+    """Haze of all is no loss, and 0.7 m still land on a receiver of 6 m: its spot is wider."""
+    result = result_of(client, "forecasts")
+    states, light = result["states"], result["by_heliostat"]
+    (soiled,) = (fault for fault in FAULTS if fault.kind == "soiled")
+    (stepped,) = (fault for fault in FAULTS if fault.kind == "drives stepped")
+    (dirty,), (off,) = soiled.heliostats, stepped.heliostats
+    clean = states[dirty]["cleanliness"]
+    assert clean["source"] == "measured"
+    assert clean["value"] == pytest.approx(1 - soiled.size, abs=0.08)
+    assert clean["ci95"][0] < clean["value"] < clean["ci95"][1]
+    assert light[dirty]["cleanliness"] == pytest.approx(clean["value"], rel=1e-3)
+    pointing = states[off]["pointing_error_mrad"]
+    assert pointing["source"] == "measured"
+    assert pointing["ci95"][0] < stepped.size / 1.18 < pointing["ci95"][1]
+    assert min(one["cleanliness"] for name, one in light.items() if name != dirty) > 0.8
+    assert result["field"]["cleanliness"] == pytest.approx(1 - soiled.size / len(light), abs=0.01)
+    for of_all in (result["sources"], result_of(client, "aim-plans")["sources"]):
+        assert of_all["cleanliness"]["measured"] < 0.05 * len(light)
+        assert of_all["pointing_error_mrad"]["measured"] >= 1
+        assert sum(of_all["pointing_error_mrad"].values()) == len(light)
+    assert result_of(client, "plans")["sources"]["cleanliness"]["measured"] >= 1
+    aims = result_of(client, "aim-plans")
+    assert aims["peak_p95_w_m2"] > 1.001 * aims["peak_w_m2"]
+
+
 @pytest.mark.full
 def test_a_hazy_week_is_seen_in_all_accuracies_and_then_gone(client: TestClient):
     (haze,) = (fault for fault in FAULTS if fault.kind == "hazy")

@@ -1,0 +1,68 @@
+"""Measure the states of mirrors in operation by photographs: their dimming and pointing errors."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from service.twin.alarms.field_overview import read_summaries, with_pointing
+from service.twin.alarms.light import find_lost_light
+from service.twin.forecasts.mirror_states import (
+    CLEANLINESS_RANGE,
+    MRAD_RANGE,
+    Estimate,
+    MirrorStates,
+)
+from service.twin.pointing.errors import PointingState
+from service.twin.runtime.runtime import Runtime
+from service.twin.studies.camera_watch import CameraWatch
+
+# Lost share of the light above which a mirror counts as dimmed. Less is not distinct from haze.
+_MIN_LOSS = 0.05
+# Photographs since the calibration by which a pointing error is known.
+_MIN_PHOTOGRAPHS = 2
+# Median of a Rayleigh distribution, in standard deviations per axis.
+_MEDIAN = math.sqrt(2 * math.log(2))
+
+
+def read_mirror_states(runtime: Runtime, names: Sequence[str]) -> MirrorStates:
+    """Measure the present states of heliostats; no session should be open."""
+    settings, wanted = runtime.settings, set(names)
+    with runtime.database.reading() as session:
+        lines = [line for line in read_summaries(session) if line.name in wanted]
+        light = CameraWatch().read(session, settings).light
+    lost = sorted(find_lost_light(light, _MIN_LOSS), key=lambda one: one.photographs)
+    name_of = {line.id: line.name for line in lines}
+    cleanliness = {
+        name_of[one.heliostat]: Estimate(
+            _left(one.share), (_left(one.max_share), _left(one.min_share))
+        )
+        for one in lost
+        if one.heliostat in name_of
+    }
+    errors = {
+        line.name: predicted_pointing_error(with_pointing(runtime, line).pointing) for line in lines
+    }
+    pointing = {name: error for name, error in errors.items() if error is not None}
+    return MirrorStates(cleanliness, pointing, settings.default_pointing_error_mrad)
+
+
+def _left(share: float) -> float:
+    """What a lost share of the light leaves."""
+    return float(np.clip(1 - share, *CLEANLINESS_RANGE))
+
+
+def predicted_pointing_error(state: PointingState | None) -> Estimate | None:
+    """Standard deviation per axis [mrad] of a heliostat's beam by photographs.
+
+    None if its mount was not calibrated, or too few photographs say how well it predicts spots.
+    Residuals of the calibration's own photographs do not. Angles of two axes have a Rayleigh
+    distribution.
+    """
+    if state is None or state.error_mrad is None or state.since_calibration < _MIN_PHOTOGRAPHS:
+        return None
+    sigma, freedom = state.error_mrad / _MEDIAN, 2 * min(state.photographs, state.since_calibration)
+    ends = (sigma * math.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.975, 0.025))
+    value, low, high = (min(one, MRAD_RANGE[1]) for one in (sigma, *ends))
+    return Estimate(value, (low, high))
