@@ -1,6 +1,7 @@
 """Scope of an effect: always, since a date, or by day, for all heliostats or some.
 
 If a mirror is canted again, or a camera has new settings, the plant is different from that date on.
+Haze of a week, or a mirror that is cleaned, ends on another date.
 Haze and wind change from day to day, so each day has separate values. Days are those of the
 photographs' times, in their recorded time zone. An effect of mirror or drive may belong to a single
 heliostat.
@@ -35,21 +36,47 @@ class Always:
 class Since:
     """From the date ``since`` on, for some ``heliostats`` or all.
 
-    A photograph without a time counts as current.
+    ``until`` is the first day without the effect; None while it acts. A photograph without a time
+    counts as current.
+
+    Raises
+    ------
+    InvalidInputError
+        If it ends before it begins.
     """
 
     since: date
     heliostats: tuple[str, ...] | None = None
+    until: date | None = None
+
+    def __post_init__(self) -> None:
+        if self.until is not None and self.until <= self.since:
+            raise InvalidInputError(
+                f"a scope since {self.since} must end after that day, got {self.until}"
+            )
+
+    def acts_at(self, taken_at: datetime | None) -> bool:
+        """Whether it acts at a time; None is the present."""
+        if taken_at is None:
+            return self.until is None
+        day = taken_at.date()
+        return self.since <= day and (self.until is None or day < self.until)
 
     def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
         """As `Always.phase`."""
         theirs = self.heliostats is None or heliostat in self.heliostats
-        return theirs and (taken_at is None or taken_at.date() >= self.since)
+        return theirs and self.acts_at(taken_at)
 
     def to_json(self) -> dict[str, Any]:
         """The scope as JSON; ``heliostats`` is null if all, or the camera, have the effect."""
         named = None if self.heliostats is None else list(self.heliostats)
-        return {"kind": "since", "since": self.since.isoformat(), "heliostats": named}
+        until = None if self.until is None else self.until.isoformat()
+        return {
+            "kind": "since",
+            "since": self.since.isoformat(),
+            "until": until,
+            "heliostats": named,
+        }
 
 
 @dataclass(frozen=True)
@@ -95,7 +122,12 @@ def scope_from_json(data: object, effect: str) -> Scope:
     if given["kind"] == "set":
         return Always(heliostats)
     if given["kind"] == "since":
-        return Since(day_from_json(given.get("since"), effect), heliostats)
+        until = given.get("until")
+        return Since(
+            day_from_json(given.get("since"), effect),
+            heliostats,
+            None if until is None else day_from_json(until, effect),
+        )
     if heliostats is not None:
         raise InvalidInputError(
             f"effect {effect}: a scope by day is of all heliostats; leave its 'heliostats' out"

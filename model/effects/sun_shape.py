@@ -52,7 +52,7 @@ class SunShapeEffect(Effect):
     about: ClassVar[str] = "Sun shape: haze that spreads the sun's light into an aureole."
     stage: ClassVar[Stage] = "optics"
     scales_with: ClassVar[frozenset[Factor]] = frozenset({"distance", "weather"})
-    comes: ClassVar[frozenset[Arrival]] = frozenset({"day"})
+    comes: ClassVar[frozenset[Arrival]] = frozenset({"since", "day"})
 
     circumsolar_ratio: Scalar = parameter(CLEAR_SKY, 0.0, 0.5, "1")
 

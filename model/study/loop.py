@@ -27,7 +27,7 @@ def study(
     ----------
     flux_images : sequence of FluxImage
         With surfaces; at least four, better of several heliostats under many suns. Effects that
-        begin on a day or differ by day are found if the photographs have times.
+        begin or end on a day, or differ by day, are found if the photographs have times.
     model : PlantModel
         The declared model.
     progress : callable
@@ -71,7 +71,7 @@ def study(
         if choice is None:
             break
         term = choice.term
-        dated, trial = scopes.refine_start_day(term, trials[term], current)
+        dated, trial = scopes.refine_span(term, trials[term], current)
         shape = (
             selection.gain_where_acting(term, trials[term], current, with_position=False)
             if has_motors

@@ -117,7 +117,10 @@ class Found:
         if scope["kind"] == "day":
             return f"{name} by day (most on {_listed([day.isoformat() for day in self.days])})"
         of = f" of {_listed(scope['heliostats'])}" if scope.get("heliostats") else ""
-        return f"{name}{of}" + (f" since {scope['since']}" if scope["kind"] == "since" else "")
+        ended = f", ended by {scope['until']}" if scope.get("until") else ""
+        return f"{name}{of}" + (
+            f" since {scope['since']}{ended}" if scope["kind"] == "since" else ""
+        )
 
 
 def _fitted(value: Any, ci95: Any, unit: str, term: Term) -> dict[str, Any]:

@@ -21,7 +21,7 @@ RELATIVE = 0.002
 
 @dataclass(frozen=True)
 class Term:
-    """A kind of effect in a scope: always, since a day, or with values by day.
+    """A kind of effect in a scope: always, since a day, perhaps until another, or by day.
 
     Attributes
     ----------
@@ -31,12 +31,15 @@ class Term:
         Days with separate values; empty for the other scopes.
     heliostats : tuple of str or None
         Heliostats with the effect; None for all.
+    until : date or None
+        First day without an effect that began; None while it acts.
     """
 
     kind: type[Effect]
     since: date | None = None
     days: tuple[date, ...] = ()
     heliostats: tuple[str, ...] | None = None
+    until: date | None = None
 
     @property
     def is_permanent(self) -> bool:
@@ -53,7 +56,9 @@ class Term:
         """When and where it acts, without the values of days."""
         if self.days:
             return ByDay()
-        return Always(self.heliostats) if self.since is None else Since(self.since, self.heliostats)
+        if self.since is None:
+            return Always(self.heliostats)
+        return Since(self.since, self.heliostats, self.until)
 
     def is_disjoint_from(self, other: "Term") -> bool:
         """Whether no heliostat has both."""
@@ -67,9 +72,9 @@ class Term:
             return False
         if self.is_permanent:
             return True
-        if taken_at is None:  # counts as the present, as in `Since`
-            return self.since is not None
-        return taken_at.date() in self.days if self.since is None else taken_at.date() >= self.since
+        if self.since is not None:
+            return Since(self.since, until=self.until).acts_at(taken_at)
+        return taken_at is not None and taken_at.date() in self.days
 
 
 class UnknownGroup(NamedTuple):

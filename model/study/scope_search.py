@@ -1,4 +1,4 @@
-"""Search the scopes of effects: the heliostat that has one, and the day on which it begins."""
+"""Search the scopes of effects: the heliostat that has one, and when it begins and ends."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ from model.study.scopes import (
     MIN_SHARE_OF_BEST,
     STRENGTHS,
     ScopeCandidate,
-    best_start_day,
+    best_span,
     single_heliostat_scopes,
     time_scopes,
 )
@@ -25,8 +25,8 @@ from model.study.trials import Trial, TrialFitter
 
 Array = NDArray[np.float64]
 
-MAX_DATE_ITERATIONS = 3
-"""Largest number of alternating fits of a start day and of the values since then."""
+MAX_SPAN_ITERATIONS = 3
+"""Largest number of alternating fits of a span and of the values in it."""
 
 
 class ScopedTrial(NamedTuple):
@@ -78,16 +78,16 @@ class ScopeSearch:
             for found in (in_time, single)
             for term in _screened(found, current.parameters.terms)
         ]
-        return dict(self._fit_start_day(term, current, dated) for term in best)
+        return dict(self._fit_span(term, current, dated) for term in best)
 
-    def refine_start_day(self, term: Term, trial: Trial, current: Trial) -> ScopedTrial:
-        """Re-estimate the start day of a judged effect from all photographs, also held-out ones."""
+    def refine_span(self, term: Term, trial: Trial, current: Trial) -> ScopedTrial:
+        """Re-estimate begin and end of a judged effect from all photographs, also held-out ones."""
         begins = term.since is not None and not self.has_full_scope(term)
         everything = np.arange(len(self.fitter.flux_images))
-        day = self._start_day(term, trial, current, everything) if begins else None
-        if day is None or day == term.since or replace(term, since=day) in current.parameters.terms:
+        scoped = self._in_best_span(term, trial, current, everything) if begins else None
+        if scoped is None:
             return ScopedTrial(term, trial)
-        return ScopedTrial(replace(term, since=day), trial.with_start_day(term, day))
+        return ScopedTrial(scoped, trial.with_scope(term, scoped))
 
     def _costs_without_scope(
         self, trial: Trial, term: Term, rows: Rows, strengths: Sequence[float]
@@ -104,29 +104,25 @@ class ScopeSearch:
         return self.fitter.costs(rows, parameters, np.array(values))
 
     def _from_the_first(self, term: Term) -> Term:
-        return replace(term, since=self.full_scope(term.kind).since)
+        return replace(term, since=self.full_scope(term.kind).since, until=None)
 
-    def _fit_start_day(self, term: Term, current: Trial, rows: Rows) -> ScopedTrial:
-        """Fit an effect in its scope; a start day and the values since then are fitted in turn."""
+    def _fit_span(self, term: Term, current: Trial, rows: Rows) -> ScopedTrial:
+        """Fit an effect in its scope; begin, end and the values between are fitted in turn."""
         trial = self.fitter.fit_added(term, current)
-        for _ in range(MAX_DATE_ITERATIONS if term.since is not None else 0):
-            day = self._start_day(term, trial, current, rows)
-            if (
-                day is None
-                or day == term.since
-                or replace(term, since=day) in current.parameters.terms
-            ):
+        for _ in range(MAX_SPAN_ITERATIONS if term.since is not None else 0):
+            scoped = self._in_best_span(term, trial, current, rows)
+            if scoped is None:
                 break
-            term = replace(term, since=day)
-            trial = self.fitter.fit_added(term, current)
+            term, trial = scoped, self.fitter.fit_added(scoped, current)
         return ScopedTrial(term, trial)
 
-    def _start_day(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> date | None:
-        """Return the start day that reduces the costs of some images most."""
+    def _in_best_span(self, term: Term, trial: Trial, current: Trial, rows: Rows) -> Term | None:
+        """Return an effect in the span that reduces the costs of some images most, if it is new."""
         rows, days = self._dated(self.fitter.touched(rows, [self._from_the_first(term)]))
         before = self.fitter.costs(rows, current.parameters, current.values[None])
-        found = best_start_day(before - self._costs_without_scope(trial, term, rows, (1.0,)), days)
-        return None if found is None else found.day
+        found = best_span(before - self._costs_without_scope(trial, term, rows, (1.0,)), days)
+        scoped = term if found is None else found.of(term)
+        return None if scoped in (term, *current.parameters.terms) else scoped
 
     def _dated(self, rows: Rows) -> DatedImages:
         """Select the images with a known day."""

@@ -1,5 +1,5 @@
-"""Screen the scopes of effects: since which day, on which days or at which heliostat an effect
-acts.
+"""Screen the scopes of effects: from which day on, until which, on which days or at which heliostat
+an effect acts.
 
 The cost of each photograph is compared with and without an effect at a few strengths. With the
 right scope the photographs inside gain and those outside lose. The most promising scopes are then
@@ -10,15 +10,16 @@ Notes
 With the savings s[k, n] of photograph n at strength k::
 
     always       max_k sum_n s[k, n]
-    since a day  max_day max_k sum_{n: day_n >= day} s[k, n]         (`best_start_day`)
+    in a span    max_span max_k sum_{n: day_n in span} s[k, n]       (`best_span`)
     by day       sum_day max(0, max_k sum_{n: day_n = day} s[k, n])  (`time_scopes`)
     one mirror   max_k sum_{n: mirror_n = mirror} s[k, n]            (`single_heliostat_scopes`)
 
-A scope is a candidate if it saves MIN_RATIO times as much as no scope.
+A scope is a candidate if it saves MIN_RATIO times as much as no scope. A span has an end if it
+saves MIN_RATIO times as much as the best one without an end.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
@@ -37,7 +38,10 @@ MIN_DAYS = 3
 """Smallest number of days for scopes in time."""
 
 MIN_RATIO = 1.1
-"""Smallest ratio of a scope's saving to that of the effect without a scope."""
+"""Smallest ratio of a scope's saving to that of the effect without a scope or an end."""
+
+MIN_SPAN = 2
+"""Smallest number of days with photographs of an effect that ended."""
 
 MAX_SCREENED, MIN_SHARE_OF_BEST = 5, 0.4
 """Number of scopes that are fitted, and their smallest saving as a share of the best one's."""
@@ -52,11 +56,19 @@ class ScopeCandidate:
 
 
 @dataclass(frozen=True)
-class StartDay:
-    """A day on which an effect may begin, and the cost that it saves since then."""
+class Span:
+    """Days on which an effect may begin and end, and the cost that it saves between them.
 
-    day: date
+    ``until`` is the first day without it; None while it acts.
+    """
+
+    since: date
+    until: date | None
     saved: float
+
+    def of(self, term: Term) -> Term:
+        """Return an effect in this span."""
+        return replace(term, since=self.since, until=self.until)
 
 
 def days_of(flux_images: Sequence[FluxImage]) -> list[date | None] | None:
@@ -82,11 +94,11 @@ def time_scopes(
             else [None]
         ):
             rows = np.flatnonzero(np.isin(heliostats, names if chosen is None else chosen))
-            found = best_start_day(saved[:, rows], [days[row] for row in rows.tolist()])
+            found = best_span(saved[:, rows], [days[row] for row in rows.tolist()])
             if found is not None and found.saved > MIN_RATIO * max(
                 0.0, saved[:, rows].sum(axis=1).max()
             ):
-                yield ScopeCandidate(Term(kind, since=found.day, heliostats=chosen), found.saved)
+                yield ScopeCandidate(found.of(Term(kind, heliostats=chosen)), found.saved)
     if "day" in kind.comes:
         each = {
             day: saved[:, [d == day for d in days]].sum(axis=1).max().clip(min=0)
@@ -117,15 +129,23 @@ def single_heliostat_scopes(
             yield ScopeCandidate(Term(kind, heliostats=(name,)), total)
 
 
-def best_start_day(saved: Array, days: Sequence[date]) -> StartDay | None:
-    """Return the start day with the largest saving; None if there is one day only.
+def best_span(saved: Array, days: Sequence[date]) -> Span | None:
+    """Return the days between which an effect saves most; None if there is one day only.
 
-    ``saved`` (strengths, N) is the saving of each photograph.
+    ``saved`` (strengths, N) is the saving of each photograph. A span of fewer than `MIN_SPAN` days
+    with photographs has no end.
     """
-    best: StartDay | None = None
-    for day in sorted(set(days))[1:]:
-        after = np.array([d >= day for d in days])
-        total = float(saved[:, after].sum(axis=1).max())
-        if best is None or total > best.saved:
-            best = StartDay(day, total)
+    known = sorted(set(days))
+    if len(known) < 2:
+        return None
+    of_day = np.array([saved[:, [d == day for d in days]].sum(axis=1) for day in known])
+    sums = np.vstack([np.zeros(len(saved)), of_day.cumsum(axis=0)])
+    total = (sums[None] - sums[:, None]).max(axis=-1)  # [first day, day after the last one]
+    begin = 1 + int(total[1:-1, -1].argmax())
+    best = Span(known[begin], None, float(total[begin, -1]))
+    first, end = np.indices(total.shape)
+    ended = np.where((end - first >= MIN_SPAN) & (end < len(known)), total, -np.inf)
+    if ended.max() > MIN_RATIO * max(0.0, best.saved):
+        begin, until = divmod(int(ended.argmax()), len(ended))
+        best = Span(known[begin], known[until], float(ended.max()))
     return best

@@ -92,15 +92,21 @@ class ForwardSelection:
 
         An effect of limited scope changes few held-out images. So it is also fitted to those and
         judged by the images of the first fit: each image judges a fit that did not see it. An
-        effect at one heliostat is judged by held-out images alone, since the others chose that
-        heliostat among many; they judge several choices.
+        effect at one heliostat, or with an end, is judged by held-out images alone, since the
+        others chose that heliostat or span among many; they judge several choices. An effect by day
+        is judged on the days that have a fitted image.
         """
         if self.scopes.has_full_scope(term):
             return self.gain(after, before, with_position)
+        rows = self.fitter.split.held_out
+        judging = np.isin(rows, self.fitter.touched(rows, [term]))
         held_out = _score_changes(
-            self.fitter.measured, _forecasts(before), _forecasts(after), with_position
+            self.fitter.measured[judging],
+            _forecasts(before, judging),
+            _forecasts(after, judging),
+            with_position,
         )
-        if term.is_permanent:
+        if term.is_permanent or term.until is not None:
             return few_gain(held_out, among=MAX_SCREENED)
         if with_position and not held_out.sum() > 0:
             return few_gain(held_out)
@@ -196,8 +202,8 @@ class _Forecasts:
     position_residuals: Array
 
 
-def _forecasts(trial: Trial) -> _Forecasts:
-    return _Forecasts(trial.cuts, trial.position_residuals)
+def _forecasts(trial: Trial, judging: NDArray[np.bool_]) -> _Forecasts:
+    return _Forecasts(trial.cuts[judging], trial.position_residuals[judging])
 
 
 def _score_changes(
@@ -217,6 +223,7 @@ def _score_changes(
 
 
 def _complexity(term: Term, trial: Trial) -> int:
-    """Number of values of a term; a date and a heliostat's name count as one each."""
+    """Number of values of a term; each date and a heliostat's name count as one."""
     numbers = sum(u.term == term for u in trial.parameters.all)
-    return numbers + (term.since is not None) + (term.heliostats is not None)
+    scope = (term.since, term.until, term.heliostats)
+    return numbers + sum(part is not None for part in scope)

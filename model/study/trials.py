@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import date
 from typing import NamedTuple
 
 import numpy as np
@@ -85,10 +84,9 @@ class Trial:
         """The fitted effects."""
         return self.parameters.effects(self.values)
 
-    def with_start_day(self, term: Term, since: date) -> "Trial":
-        """Return the trial with another start day of one effect."""
-        later = replace(term, since=since)
-        terms = tuple(later if other == term else other for other in self.parameters.terms)
+    def with_scope(self, term: Term, scoped: Term) -> "Trial":
+        """Return the trial with one effect in another scope of as many values."""
+        terms = tuple(scoped if other == term else other for other in self.parameters.terms)
         return replace(self, parameters=self.parameters.of_terms(terms))
 
 

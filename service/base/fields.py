@@ -392,6 +392,9 @@ class EffectScope(ReportPart):
     since: date | None = Field(
         default=None, description="Day of the first photograph after the change."
     )
+    until: date | None = Field(
+        default=None, description="Day of the first photograph without it; null: it still acts."
+    )
     heliostats: list[str] | None = Field(default=None, description="null: all, or the camera.")
 
 

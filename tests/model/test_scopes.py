@@ -20,7 +20,7 @@ from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, conclude, study, study_to_json
 from model.study.judging import few_gain, split
 from model.study.parameters import ParameterVector, Term, copied
-from model.study.scopes import StartDay, best_start_day, single_heliostat_scopes, time_scopes
+from model.study.scopes import Span, best_span, single_heliostat_scopes, time_scopes
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
 from tests.model.scenes import FIRST, photographs
@@ -49,6 +49,15 @@ def test_an_effect_acts_since_its_day_and_in_the_plant_of_today():
     assert acting([since], datetime(2024, 6, 1, 23, tzinfo=UTC), "far") == ()
     assert acting([since], datetime(2024, 6, 2, 0, tzinfo=UTC), "far") == (since,)
     assert acting([since], None, "far") == acting([since], None, None) == (since,)
+
+
+def test_an_effect_that_ended_acts_in_its_days_only():
+    hazy = SunShapeEffect(0.1, scope=Since(date(2024, 6, 2), until=date(2024, 6, 9)))
+    for day, acts in ((1, False), (2, True), (8, True), (9, False)):
+        assert acting([hazy], datetime(2024, 6, day, 12, tzinfo=UTC), "far") == (hazy,) * acts
+    assert acting([hazy], None, "far") == ()
+    with pytest.raises(InvalidInputError, match="must end after that day, got 2024-06-02"):
+        Since(date(2024, 6, 2), until=date(2024, 6, 2))
 
 
 def test_an_effect_of_one_heliostat_acts_at_no_other():
@@ -90,7 +99,7 @@ def test_forecasts_hold_each_effect_when_and_where_it_acts(effect: Effect):
 
 
 def test_scopes_survive_json():
-    for effect in (CANTED, ROUGH, SlopeError(1.0, scope=Since(CHANGE, ("far",)))):
+    for effect in (CANTED, ROUGH, SlopeError(1.0, scope=Since(CHANGE, ("far",), date(2024, 7, 1)))):
         assert effect_from_json(effect_to_json(effect)).scope == effect.scope
     assert effect_to_json(ROUGH)["scope"] == {"kind": "set", "heliostats": ["far"]}
     hazy = effect_from_json(effect_to_json(SunShapeEffect(0.03, scope=ByDay(HAZY))))
@@ -105,6 +114,11 @@ def test_scopes_survive_json():
         ({"kind": "sometimes"}, "'scope' must be"),
         ({"kind": "since", "since": "June"}, "a day must be a date such as 2024-06-02, got June"),
         ({"kind": "since"}, "a day must be a date"),
+        ({"kind": "since", "since": "2024-06-02", "until": 3}, "a day must be a date"),
+        (
+            {"kind": "since", "since": "2024-06-02", "until": "2024-06-01"},
+            "must end after that day",
+        ),
         ({"kind": "set", "heliostats": "far"}, "must be a list of names, or null for all, got far"),
         ({"kind": "set", "heliostats": []}, "must be a list of names"),
         ({"kind": "day", "heliostats": ["far"]}, "a scope by day is of all heliostats"),
@@ -121,7 +135,12 @@ def test_a_malformed_scope_is_refused(scope: object, says: str):
 
 def test_a_scope_names_no_other_heliostats_than_the_parameters():
     canted = effect_to_json(CANTED)
-    assert canted["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
+    assert canted["scope"] == {
+        "kind": "since",
+        "since": "2024-06-16",
+        "until": None,
+        "heliostats": ["far"],
+    }
     assert effect_from_json({**canted, "scope": {"kind": "set"}}).heliostats == ["far"]
     with pytest.raises(
         InvalidInputError, match="must be those that its parameters name, or null, got near"
@@ -176,13 +195,29 @@ def test_unknowns_of_one_heliostat_touch_its_later_photographs():
 def test_the_day_of_a_change_is_the_one_after_which_most_is_saved():
     days = [date(2024, 6, 1 + n) for n in range(8)]
     saved = np.array([[-1.0, 0.5, -1, -1, 3, 2, -0.5, 3], [-4.0, 0, -4, -4, 2, 1, -2, 2]])
-    assert best_start_day(saved, days) == StartDay(date(2024, 6, 5), 7.5)
-    assert best_start_day(saved[:, :1], days[:1]) is None
+    assert best_span(saved, days) == Span(date(2024, 6, 5), None, 7.5)
+    assert best_span(saved[:, :1], days[:1]) is None
     since, by_day = time_scopes(
         CameraResponse, saved, [days[0]] * 4 + [days[1]] * 4, np.array(["a"] * 8)
     )
     assert since.term == Term(CameraResponse, since=days[1])
     assert by_day.term == Term(CameraResponse, days=tuple(days[:2]))
+
+
+def test_an_effect_ends_where_later_photographs_lose_by_it():
+    days = [date(2024, 6, 1 + n) for n in range(8)]
+    saved = np.array([[-1.0, -2, 3, 2, 3, -2, -1, -2]])
+    assert best_span(saved, days) == Span(days[2], days[5], 8.0)
+    (since, _) = time_scopes(CameraResponse, saved, days, np.array(["a"] * 8))
+    assert since.term == Term(CameraResponse, since=days[2], until=days[5])
+    # From the first photograph on. One last day that is not clearly worse is no end, nor is one day
+    # a span.
+    early = np.array([[3.0, 2, 3, -2, -1, -2, -1, -2]])
+    assert best_span(early, days) == Span(days[0], days[3], 8.0)
+    late = np.array([[-1.0, -2, 3, 2, 3, 3, 3, -0.5]])
+    assert best_span(late, days) == Span(days[2], None, 13.5)
+    once = np.array([[-1.0, -2, 9, -2, -1, -1, -1, 1]])
+    assert best_span(once, days) == Span(days[1], days[3], 7.0)
 
 
 def test_one_heliostat_is_promising_where_the_others_lose_or_save_nothing():
@@ -253,7 +288,12 @@ def test_nothing_comes_or_goes_in_calm_photographs():
 def test_recanted_mirror_is_found_with_its_date():
     report = study_to_json(found_in([CANTED], "facet_canting", "slope_error"))
     (found,) = report["effects"]
-    assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": ["far"]}
+    assert found["scope"] == {
+        "kind": "since",
+        "since": "2024-06-16",
+        "until": None,
+        "heliostats": ["far"],
+    }
     assert "facet canting of far since 2024-06-16" in report["conclusion"]
     assert report["verdict"] == "effect"
     tilts = np.array(found["parameters"]["y_mrad"]["value"]["far"])
@@ -266,8 +306,29 @@ def test_changed_camera_is_found_with_its_date():
         found_in([CameraResponse(1.1, scope=Since(CHANGE))], "camera_response", "camera_blur")
     )
     (found,) = report["effects"]
-    assert found["scope"] == {"kind": "since", "since": "2024-06-16", "heliostats": None}
+    assert found["scope"] == {
+        "kind": "since",
+        "since": "2024-06-16",
+        "until": None,
+        "heliostats": None,
+    }
     assert found["parameters"]["gamma"]["value"] == pytest.approx(1.1, abs=0.02)
+
+
+def test_haze_of_a_week_is_found_with_begin_and_end():
+    """Photographs of each third day; the haze acts on three of their days."""
+    week = Since(date(2024, 6, 8), until=date(2024, 6, 15))
+    report = study_to_json(found_in([SunShapeEffect(0.2, scope=week)], "sun_shape", "slope_error"))
+    (found,) = report["effects"]
+    assert found["scope"] == {
+        "kind": "since",
+        "since": "2024-06-10",
+        "until": "2024-06-16",
+        "heliostats": None,
+    }
+    assert "sun shape since 2024-06-10, ended by 2024-06-16" in report["conclusion"]
+    assert found["parameters"]["circumsolar_ratio"]["value"] == pytest.approx(0.2, abs=0.02)
+    assert report["verdict"] == "effect"
 
 
 @pytest.mark.full
