@@ -308,6 +308,7 @@ def study(record: Recorder) -> None:
     record.call("list_studies", "GET /v1/studies")
     assert record.call("get_study", f"GET {path}")["verdict"] == "effect"
     record.call("get_study_report", f"GET {path}/report")
+    record.call("get_study_change", f"GET {path}/change")
     reason = {"reason": "the camera's maker confirms the curve"}
     record.call("adopt_study", f"POST {path}/adopt", 201, json=reason)
     record.call("list_models", "GET /v1/models")

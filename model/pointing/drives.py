@@ -347,6 +347,15 @@ class ChangePointScore(NamedTuple):
     information: Array
 
 
+class LeftOutErrors(NamedTuple):
+    """Errors (H, M) [rad] of predictions by other measurements, and their standard deviations per
+    direction; NaN for foreign measurements and padding.
+    """
+
+    errors: Array
+    std: Array
+
+
 @dataclass(frozen=True, eq=False)
 class ConditionedModel:
     """The linear model with inferred changes, for further questions to the data."""
@@ -387,6 +396,27 @@ class ConditionedModel:
         ]
         is_known = self.model.readings.used & ~self.changes.mask(*_FOREIGN)
         return np.where(is_known[..., None], residuals, np.nan)
+
+    def left_out_errors(self, whole_days: bool) -> "LeftOutErrors":
+        """Predict each measurement by all others, or by those of all other days.
+
+        Measurements of a day share the jitter of the drives, so they say little about another day.
+        Those of an unknown time count as a day each. Source: Rasmussen and Williams 2006, eq. 5.12,
+        for blocks of measurements.
+        """
+        readings = self.model.readings
+        heliostats, most = readings.used.shape
+        solution, day = self.changes.solve(self.model), np.floor(readings.days)
+        same = np.eye(most, dtype=bool) | (whole_days & (day[:, :, None] == day[:, None]))
+        blocks = solution.precision(self.model) * same.repeat(2, axis=1).repeat(2, axis=2)
+        covariance = np.linalg.inv(blocks)
+        residuals = (covariance @ solution.precision_y[..., None]).reshape(heliostats, most, 2)
+        variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(heliostats, most, 2)
+        is_known = readings.used & ~self.changes.mask(*_FOREIGN)
+        return LeftOutErrors(
+            np.where(is_known, np.linalg.norm(residuals, axis=-1), np.nan),
+            np.where(is_known, np.sqrt(variance.mean(axis=-1)), np.nan),
+        )
 
     def change_point_score(self, by_change: Array) -> ChangePointScore:
         """Score a change at each measurement by the residuals' derivatives ``by_change`` (H, M, 2).

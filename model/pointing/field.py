@@ -13,6 +13,7 @@ from model.pointing.covariates import ExplainedShare, explain_errors
 from model.pointing.drives import Noise
 from model.pointing.kinematics import KinematicChain
 from model.pointing.mounts import CalibratedMount, mounts_of
+from model.pointing.prediction import with_predictions
 from model.pointing.readings import Reading, pad_readings
 from model.pointing.reasons import Contradiction, ContradictionClassifier
 from model.site import Site
@@ -93,6 +94,8 @@ def calibrate_field(
         )
         is_unusual = done.prior.is_unusual(chain.rows(rows))
         unusual |= {name for name, differs in zip(of_kind, is_unusual, strict=True) if differs}
+    predicted = with_predictions([every[name] for name in names], kinds, arrays)
+    every = dict(zip(names, predicted, strict=True))
     mounts = {name: every[name] for name in names if requested is None or name in requested}
     classifier = ContradictionClassifier(heliostats, every, targets, site)
     contradictions = {

@@ -64,6 +64,19 @@ class Step:
 
 
 @dataclass(frozen=True)
+class PredictedError:
+    """Pointing error that a next photograph will show: median and 90 % interval [rad].
+
+    ``measurements`` is the number of measurements whose predictions it is based on.
+    """
+
+    median: float
+    low: float
+    high: float
+    measurements: int
+
+
+@dataclass(frozen=True)
 class Cause:
     """Likely cause of a step: ``referenced`` or ``lost_steps``, and a ``detail`` in words."""
 
@@ -127,6 +140,10 @@ class CalibratedMount:
     residuals : (M, 2) [rad]
         Of the measurements.
     steps : tuple of Step
+    predicted : (M,) [rad]
+        Errors of the measurements when other days predict them; NaN if they are not predicted.
+    prediction : PredictedError or None
+        None if too few measurements are predicted.
     noise : Noise
     """
 
@@ -142,6 +159,8 @@ class CalibratedMount:
     foreign: NDArray[np.bool_]
     residuals: Array
     steps: tuple[Step, ...]
+    predicted: Array
+    prediction: PredictedError | None = None
     noise: Noise = field(default_factory=Noise)
 
     @classmethod
@@ -161,6 +180,7 @@ class CalibratedMount:
             foreign=np.zeros(0, dtype=bool),
             residuals=none,
             steps=(),
+            predicted=np.zeros(0),
         )
 
     @property
@@ -303,6 +323,7 @@ def mounts_of(
                 foreign=posterior.foreign[row, known],
                 residuals=done.residuals[row, known],
                 steps=tuple(_steps(posterior, row, nominal, readings)),
+                predicted=np.full(known.stop, np.nan),
                 noise=done.noise,
             )
         )

@@ -14,7 +14,7 @@ from model.pointing.covariates import ExplainedShare
 from model.pointing.drives import Noise
 from model.pointing.field import FieldMounts
 from model.pointing.kinematics import NAMES, PARAMETERS
-from model.pointing.mounts import CalibratedMount, Step, cause_of
+from model.pointing.mounts import CalibratedMount, PredictedError, Step, cause_of
 from model.pointing.readings import Reading
 from model.pointing.reasons import Contradiction
 from model.times import format_time
@@ -76,16 +76,12 @@ def mount_to_json(
     effects: Iterable[Effect] = (),
 ) -> dict[str, Any]:
     """Return a mount with its ``readings`` in order of time; ``effects`` moved their suns."""
-    errors = 1e3 * mount.errors_rad[~mount.foreign]
     return {
         "valid_from": _begin(mount),
         "sun": sun_to_json(effects),
         "measurements": len(readings),
         "undated": mount.n_undated,
-        "residual_mrad": {
-            "median": round(float(np.median(errors)), 3) if errors.size else None,
-            "p90": round(float(np.percentile(errors, 90)), 3) if errors.size else None,
-        },
+        "predicted_error_mrad": _prediction(mount),
         "parameters": parameters_to_json(mount),
         "steps": [
             {
@@ -113,9 +109,33 @@ def mount_to_json(
                 name: _rounded(getattr(mount, name))
                 for name in ("drift", "jitter", "stepped", "residuals")
             },
+            "predicted": [None if np.isnan(e) else _rounded(e) for e in mount.predicted],
             "foreign": np.nonzero(mount.foreign)[0].tolist(),
         },
     }
+
+
+def _prediction(mount: CalibratedMount) -> dict[str, Any]:
+    """Describe the predicted pointing error; null if too few measurements are predicted."""
+    found = mount.prediction
+    if found is None:
+        count = int(np.isfinite(mount.predicted).sum())
+        return {"median": None, "ci90": None, "measurements": count}
+    return {
+        "median": _rounded(1e3 * found.median, 3),
+        "ci90": _rounded([1e3 * found.low, 1e3 * found.high], 3),
+        "measurements": found.measurements,
+    }
+
+
+def _prediction_from_json(document: Any) -> PredictedError | None:
+    """Read a document of `_prediction`."""
+    if document is None or document["median"] is None:
+        return None
+    low, high = document["ci90"]
+    return PredictedError(
+        1e-3 * document["median"], 1e-3 * low, 1e-3 * high, document["measurements"]
+    )
 
 
 def _begin(mount: CalibratedMount) -> str | None:
@@ -162,6 +182,9 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
             for name in ("drift", "jitter", "stepped", "residuals")
         }
         foreign = np.isin(np.arange(count), history["foreign"])
+        # Documents of before November 2026 have no predictions.
+        predicted = np.array(history.get("predicted", [None] * count), dtype=np.float64)
+        prediction = _prediction_from_json(document.get("predicted_error_mrad"))
         entries = [document["parameters"][name] for name in NAMES]
         parameters, spread, prior = (
             np.array([e[key] for e in entries]) for key in ("value", "std", "prior_std")
@@ -189,6 +212,8 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         raise _format_error(where, error) from None
     if not finite:
         raise InvalidInputError(f"{where}: a calibrated mount must have finite numbers only")
+    if len(predicted) != count:
+        raise InvalidInputError(f"{where}: 'predicted' needs as many values as 'at'")
     return CalibratedMount(
         parameters=parameters,
         covariance=covariance,
@@ -198,6 +223,8 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         days=days,
         foreign=foreign,
         steps=steps,
+        predicted=predicted,
+        prediction=prediction,
         noise=noise or Noise(),
         **values,
     )

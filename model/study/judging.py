@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap, spearmanr, t
 
 from model.study.flux_images import FluxImage
-from model.study.scopes import days_of
+from model.study.scopes import MIN_SPAN, days_of
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -148,6 +148,38 @@ def few_gain(differences: Array, among: int = 1) -> Gain:
     error = float(variance / count) ** 0.5
     reach = float(t.ppf(1 - 0.025 / among, freedom)) * error
     return Gain(mean, mean - reach, mean + reach, mean / error)
+
+
+WORSE = 0.002
+"""Smallest mean loss of accuracy [1] for which an effect is contradicted."""
+
+
+def is_worse(gain: Gain) -> bool:
+    """Whether a gain is a significant loss of more than `WORSE`."""
+    return gain.high < 0 and gain.mean < -WORSE
+
+
+@dataclass(frozen=True)
+class EffectEnd:
+    """The day from which photographs are worse with an effect, and its gain on them."""
+
+    day: date
+    gain: Gain
+
+
+def find_end(gains: Array, days: Sequence[date]) -> EffectEnd | None:
+    """Return the day from which an effect makes photographs worse; None if it does not.
+
+    ``gains`` (N,) are changes of accuracy by the effect on photographs of ``days``. They must be
+    worse to the last one, on `MIN_SPAN` days at least, so that a single day ends nothing.
+    """
+    taken, known = np.array(days), sorted(set(days))
+    if len(known) < MIN_SPAN:
+        return None
+    ends = known[: len(known) - MIN_SPAN + 1]
+    day = min(ends, key=lambda day: gains[taken >= day].sum())
+    gain = few_gain(gains[taken >= day], among=len(ends))
+    return EffectEnd(day, gain) if is_worse(gain) else None
 
 
 def rank_correlation(a: Array, b: Array) -> float:

@@ -471,6 +471,19 @@ class StudyReport(ReportPart):
     residual: Residual = Field(default=Residual(), description="What is left.")
 
 
+class PredictedErrorOut(BaseModel):
+    """Pointing error of photographs that a calibration has not seen."""
+
+    median: float | None = Field(
+        description=(
+            "Median angle at the mirror between forecast and measured spots [mrad], by measurements"
+            " that were left out; null for fewer than 3, or too many outliers."
+        )
+    )
+    ci90: tuple[float, float] | None = Field(description="Interval of 90 % of spots [mrad].")
+    measurements: int = Field(description="Number of measurements that were left out in turn.")
+
+
 class MountReport(BaseModel):
     """The result of a mount calibration, also of `heliotwin calibrate`."""
 
@@ -479,8 +492,9 @@ class MountReport(BaseModel):
         description="Effects of the plant's model that moved the sun when it was calibrated.",
     )
     measurements: int = Field(description="How many measurements the calibration used.")
-    residual_mrad: dict[str, float | None] = Field(
-        description="Between forecast and measured spots [mrad]."
+    predicted_error_mrad: PredictedErrorOut = Field(
+        default=PredictedErrorOut(median=None, ci90=None, measurements=0),
+        description="Pointing error that a next photograph will show.",
     )
     parameters: dict[str, dict[str, Any]] = Field(
         description=(

@@ -184,6 +184,45 @@ def test_measurements_left_out_lie_within_their_intervals(world):
     assert 0.84 < np.mean(inside) < 0.96  # 90 % of the plane's two directions
 
 
+@pytest.mark.parametrize("count", [6, 12, 30])
+def test_the_predicted_error_is_that_of_spots_of_other_days(world, count: int):
+    """The fit's residuals are smaller, the more so the fewer measurements there are."""
+    field, truths, readings = world
+    generator = np.random.default_rng(6)
+    few = {name: own[:: 40 // count][:count] for name, own in readings.items()}
+    done = calibrate(field, few, QUIET)
+    inside, unseen, fitted, predicted = [], [], [], []
+    for name, mount in done.mounts.items():
+        fresh = series(field[name], truths[name], np.linspace(1.5, 300.5, 30), generator)
+        errors = pointing_error(field[name], mount, fresh)
+        found = mount.prediction
+        assert found is not None
+        assert found.measurements == count
+        inside += ((errors >= found.low) & (errors <= found.high)).tolist()
+        unseen.append(np.median(errors))
+        predicted.append(found.median)
+        fitted.append(np.median(mount.errors_rad))
+    assert 0.85 < np.mean(inside) < 0.97
+    assert np.mean(predicted) == pytest.approx(np.mean(unseen), rel=0.3)
+    assert np.mean(fitted) < (0.8 if count < 30 else 0.95) * np.mean(unseen)
+
+
+def test_too_few_measurements_or_too_many_outliers_predict_nothing(world):
+    field, _, readings = world
+    few = {name: own[:2] if name < "H05" else own for name, own in readings.items()}
+    generator = np.random.default_rng(7)
+    few["H09"] = [
+        replace(one, spot=one.spot + generator.uniform(-4, 4, 3) * (place < 8))
+        for place, one in enumerate(generator.permutation(np.array(readings["H09"]))[:20])
+    ]
+    done = calibrate(field, few)
+    assert done.mounts["H09"].foreign.mean() > 0.25
+    for name, mount in done.mounts.items():
+        assert (mount.prediction is not None) == ("H05" <= name < "H09")
+    report = field_to_json(done, {})["heliostats"]["H00"]["predicted_error_mrad"]
+    assert (report["median"], report["ci90"]) == (None, None)
+
+
 def test_five_measurements_lean_on_the_field(world):
     field, _, readings = world
     prior = calibrate(field, {name: own for name, own in readings.items() if name != "H03"}).prior
@@ -461,6 +500,11 @@ def test_documents_bring_the_mount_back(world):
         )
         np.testing.assert_allclose(first.point, again.point, atol=1e-4)
         assert first.std_m == pytest.approx(again.std_m, rel=1e-3)
+    np.testing.assert_allclose(mount.predicted, back.predicted, atol=1e-8)
+    assert back.prediction is not None
+    assert back.prediction.high == pytest.approx(mount.prediction.high, abs=1e-6)
+    earlier = {key: value for key, value in document.items() if key != "predicted_error_mrad"}
+    assert mount_from_json(earlier, "here").prediction is None
     with pytest.raises(InvalidInputError, match="here"):
         mount_from_json({**document, "covariance": [1]}, "here")
     with pytest.raises(InvalidInputError, match="finite"):

@@ -18,7 +18,7 @@ from model.errors import InvalidInputError
 from model.forecast import View, align
 from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, conclude, study, study_to_json
-from model.study.judging import few_gain, split
+from model.study.judging import few_gain, find_end, split
 from model.study.parameters import ParameterVector, Term, copied
 from model.study.scopes import Span, best_span, single_heliostat_scopes, time_scopes
 from service.base.settings import FIGURE_SCALES
@@ -218,6 +218,19 @@ def test_an_effect_ends_where_later_photographs_lose_by_it():
     assert best_span(late, days) == Span(days[2], None, 13.5)
     once = np.array([[-1.0, -2, 9, -2, -1, -1, -1, 1]])
     assert best_span(once, days) == Span(days[1], days[3], 7.0)
+
+
+def test_an_effect_ends_if_all_later_photographs_are_worse_for_several_days():
+    days = [date(2024, 6, 1 + n // 3) for n in range(24)]
+    gains = np.where(np.arange(24) < 12, 0.03, -0.03) + np.tile([-0.01, 0, 0.01], 8)
+    end = find_end(gains, days)
+    assert end is not None
+    assert (end.day, round(end.gain.mean, 6)) == (date(2024, 6, 5), -0.03)
+    assert find_end(-gains, days) is None  # the last photographs need it
+    assert find_end(gains[:15], days[:15]) is None  # a single day
+    assert find_end(0.01 * gains, days) is None  # less than counts
+    assert find_end(gains * np.tile([5, -3, -1], 8), days) is None  # by chance
+    assert find_end(gains[:1], days[:1]) is None
 
 
 def test_one_heliostat_is_promising_where_the_others_lose_or_save_nothing():

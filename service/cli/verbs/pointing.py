@@ -59,11 +59,14 @@ def calibrate(
     if said is not None:
         console.print(said, style="yellow", highlight=False)
     table = make_table(
-        "Mounts", "heliostat", "measurements", "residual [mrad]", "90 %", "steps", "outliers"
+        "Mounts", "heliostat", "measurements", "predicted error [mrad]", "90 %", "steps", "outliers"
     )
     for name, entry in report["heliostats"].items():
-        left = entry["residual_mrad"]
-        figures = ("" if left[key] is None else f"{left[key]:.2f}" for key in ("median", "p90"))
+        left = entry["predicted_error_mrad"]
+        figures = ("–", "–")
+        if left["ci90"] is not None:
+            low, high = left["ci90"]
+            figures = (f"{left['median']:.2f}", f"{low:.2f} to {high:.2f}")
         table.add_row(
             name,
             str(entry["measurements"]),

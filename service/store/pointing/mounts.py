@@ -23,10 +23,7 @@ def _mounts(heliostat: HeliostatRow) -> Select[MountRow]:
 
 
 def add_mount(session: Session, heliostat: HeliostatRow, document: dict[str, Any]) -> MountRow:
-    """Store a mount, valid from the start of its newest state.
-
-    It replaces the newest version if that has the same start, else it is the next version. So
-    versions count changes of the mount, not calibrations.
+    """Store a mount as the next version, valid from the start of its newest state.
 
     Raises
     ------
@@ -38,9 +35,6 @@ def add_mount(session: Session, heliostat: HeliostatRow, document: dict[str, Any
     valid_from = None if since is None else datetime.fromisoformat(since)
     for _ in range(ROUNDS):
         newest = session.scalar(_mounts(heliostat).order_by(MountRow.version.desc()).limit(1))
-        if newest is not None and newest.valid_from == valid_from:
-            newest.document, newest.created_at = document, now()
-            return newest
         row = MountRow(
             heliostat_id=heliostat.id,
             version=1 if newest is None else newest.version + 1,

@@ -51,6 +51,7 @@ from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
+from service.twin.studies.field_change import ContradictedEffect
 
 AlarmId = Annotated[
     str,
@@ -167,8 +168,9 @@ def compute_alarms(
     lines: Sequence[HeliostatOverview],
     settings: Settings,
     cameras: CameraReadings,
+    contradicted: Sequence[ContradictedEffect],
 ) -> list[Alarm]:
-    """Compute the alarms of the plant, its cameras and its heliostats.
+    """Compute the alarms of the plant, its cameras, its model and its heliostats.
 
     They are acknowledged only as surfaces are.
     """
@@ -180,6 +182,7 @@ def compute_alarms(
         *_camera(session),
         *_watch_cameras(session, cameras.changes, zone),
         *_clock(session),
+        *_ended_effects(contradicted),
     ]
     found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
     found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
@@ -572,6 +575,20 @@ def _clock(session: Session) -> Iterator[Alarm]:
             "set the clock that suns are computed by; correct the suns of photographs since then,"
             " and calibrate again",
             f"{clock['since']} {'slow' if clock['minutes'] > 0 else 'fast'}",
+        )
+
+
+def _ended_effects(contradicted: Sequence[ContradictedEffect]) -> Iterator[Alarm]:
+    """Report adopted effects that later photographs contradict."""
+    for one in contradicted:
+        action = f"end it by {one.until}" if one.can_end else "withdraw it"
+        yield Alarm(
+            "effect_ended",
+            None,
+            datetime.combine(one.until, clock(), UTC),
+            one.in_words,
+            f"{action}, see /studies/{one.study}/change",
+            f"{one.study} {one.key}",
         )
 
 

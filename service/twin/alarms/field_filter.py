@@ -101,7 +101,8 @@ METRICS: dict[str, Metric] = {
             "mrad",
             2,
             f"How far off light lands by the calibrated mount: median of the {NEWEST} newest"
-            " photographs, none from before it last moved.",
+            " photographs, none from before it last moved. Those of the calibration are forecast by"
+            " others.",
             lambda line: None if line.pointing is None else line.pointing.error_mrad,
         ),
         Metric(

@@ -33,6 +33,7 @@ from service.twin.alarms.field_overview import (
 )
 from service.twin.runtime.runtime import Runtime
 from service.twin.studies.camera_watch import CHANGES, CameraChange, CameraWatch
+from service.twin.studies.field_change import EffectWatch
 
 logger = logging.getLogger("heliotwin.jobs")
 
@@ -68,7 +69,7 @@ class FieldStateWriter:
     """Writer of the state of heliostats whose data changed, and of the alarms."""
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime, self._watch = runtime, CameraWatch()
+        self._runtime, self._watch, self._effects = runtime, CameraWatch(), EffectWatch(runtime)
         self._marks, self._written_s = "", -_AGAIN_S
         self._has_limit, self.is_large = False, False
 
@@ -112,7 +113,7 @@ class FieldStateWriter:
         return len(reading.pending)
 
     def _read(self) -> _Reading:
-        settings = self._runtime.settings
+        settings, contradicted = self._runtime.settings, self._effects.read()
         with self._runtime.database.reading() as session:
             revision, at, marks = (
                 field_state.read_field_state(session).revision,
@@ -120,7 +121,7 @@ class FieldStateWriter:
                 read_marks(session),
             )
             lines, cameras = read_summaries(session), self._watch.read(session, settings)
-            alarms = compute_alarms(session, lines, settings, cameras)
+            alarms = compute_alarms(session, lines, settings, cameras, contradicted)
         return _Reading(revision, at, marks, lines, cameras.changes, alarms)
 
     def _compute(

@@ -5,14 +5,24 @@ The current version is the newest that is not withdrawn. No version is deleted, 
 requested, even withdrawn ones.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from model.effects import Effect, effect_to_json, effects_from_json, in_light_order
+from model.effects import (
+    Always,
+    ByDay,
+    Effect,
+    Since,
+    effect_to_json,
+    effects_from_json,
+    in_light_order,
+)
+from model.errors import InvalidInputError
 from model.plant_model import PlantModel
 from model.site import Site
 from service import store
@@ -72,6 +82,12 @@ def find_adopted(session: Session, study: int) -> ModelRow | None:
     """The newest version adopted from a study, unless it is withdrawn."""
     row = newest_of(session, [study]).get(study)
     return None if row is None or row.withdrawn_at else row
+
+
+def is_current(session: Session, study: int) -> bool:
+    """Whether the current version was adopted from a study."""
+    held = find_adopted(session, study)
+    return held is not None and held.number == current_number(session)
 
 
 def newest_of(session: Session, studies: Sequence[int]) -> dict[int, ModelRow]:
@@ -141,15 +157,120 @@ def _compose(
     )
 
 
-def _with_found(base: ModelRow | None, study: StudyRow) -> tuple[Effect, ...]:
-    """The effects of the version that a study used, and those that it found."""
-    return (*(() if base is None else _effects(base.effects)), *_effects(study.report))
+Ends = Mapping[str, date]
+"""First days without effects that ended, by `effect_key`."""
 
 
-def model_if_adopted(session: Session, study: StudyRow) -> ModelVersion:
-    """The plant's model as it would be after a study, loaded with its report, is adopted."""
-    base, number = _row(session, study.model), current_number(session) + 1
-    return _compose(session, number, _with_found(base, study), declared_of(session, base))
+def effect_key(effect: Effect) -> str:
+    """Name of an effect, with the heliostats of its scope if it has some: ``soiling of AB12``."""
+    named = None if isinstance(effect.scope, ByDay) else effect.scope.heliostats
+    return effect.name if named is None else f"{effect.name} of {' '.join(named)}"
+
+
+def is_open(effect: Effect) -> bool:
+    """Whether an effect acts on all photographs to come, with the same values."""
+    scope = effect.scope
+    return isinstance(scope, Always) or (isinstance(scope, Since) and scope.until is None)
+
+
+def first_day(effect: Effect, study: StudyRow) -> date:
+    """The first day of an effect that a study found: of its scope, else of the photographs."""
+    if isinstance(effect.scope, Since):
+        return effect.scope.since
+    return (study.first_taken_at or study.created_at).date()
+
+
+def effects_of_study(study: StudyRow, ends: Ends | None = None) -> tuple[Effect, ...]:
+    """The effects that a study, loaded with its report, found, some of them with an end.
+
+    Raises
+    ------
+    InvalidInputError
+        If one of ``ends`` is of no effect that acts still, or not after its first day.
+    """
+    found, ends = _effects(study.report), ends or {}
+    if unknown := set(ends) - {effect_key(effect) for effect in found if is_open(effect)}:
+        raise InvalidInputError(
+            f"until: study {study.id} found no {', '.join(sorted(unknown))} that acts still"
+        )
+    return tuple(
+        _ended(effect, first_day(effect, study), ends[effect_key(effect)])
+        if effect_key(effect) in ends
+        else effect
+        for effect in found
+    )
+
+
+def _ended(effect: Effect, since: date, until: date) -> Effect:
+    named = None if isinstance(effect.scope, ByDay) else effect.scope.heliostats
+    return replace(effect, scope=Since(since, named, until))
+
+
+def without(model: ModelVersion, effects: Iterable[Effect]) -> ModelVersion:
+    """A model without some of its effects."""
+    left_out = {effect_text(effect) for effect in effects}
+    kept = tuple(effect for effect in model.effects if effect_text(effect) not in left_out)
+    return replace(model, effects=kept)
+
+
+def effect_text(effect: Effect) -> str:
+    """Text that is the same for equal effects."""
+    return str(effect_to_json(effect))
+
+
+@dataclass(frozen=True)
+class _NextModel:
+    """The version that an adoption is based on, and the effects after it."""
+
+    base: ModelRow | None
+    effects: tuple[Effect, ...]
+
+
+def _next_model(session: Session, study: StudyRow, ends: Ends) -> _NextModel:
+    """Add what a study found to the version that it used.
+
+    If it is adopted, its effects get their ``ends`` in the current version.
+    """
+    found = effects_of_study(study, ends)
+    if ends and find_adopted(session, study.id) is not None:
+        base = find_current(session)
+        after = dict(zip(map(effect_text, _effects(study.report)), found, strict=True))
+        current = () if base is None else _effects(base.effects)
+        return _NextModel(base, tuple(after.get(effect_text(e), e) for e in current))
+    base = _row(session, study.model)
+    return _NextModel(base, (*(() if base is None else _effects(base.effects)), *found))
+
+
+def model_if_adopted(session: Session, study: StudyRow, ends: Ends | None = None) -> ModelVersion:
+    """The plant's model as it would be after a study, loaded with its report, is adopted.
+
+    Raises what `effects_of_study` raises.
+    """
+    next_, number = _next_model(session, study, ends or {}), current_number(session) + 1
+    return _compose(session, number, next_.effects, declared_of(session, next_.base))
+
+
+@dataclass(frozen=True, eq=False)
+class AdoptedEffect:
+    """An effect of the current version, and the study that found it, loaded with its report."""
+
+    effect: Effect
+    study: StudyRow
+
+
+def adopted_effects(session: Session) -> list[AdoptedEffect]:
+    """The effects of the current version that acts still, and were adopted from studies."""
+    current = find_current(session)
+    acting = () if current is None else tuple(filter(is_open, _effects(current.effects)))
+    rows = [row for row in list_models(session) if row.withdrawn_at is None]
+    numbers = dict.fromkeys(row.study_id for row in reversed(rows) if row.study_id is not None)
+    found = dict[str, AdoptedEffect]()
+    for study in (store.get_study(session, number) for number in numbers if acting):
+        texts = {effect_text(effect) for effect in _effects(study.report)}
+        for effect in acting:
+            if (text := effect_text(effect)) in texts:
+                found.setdefault(text, AdoptedEffect(effect, study))
+    return list(found.values())
 
 
 def find_model(session: Session, effects: Sequence[Effect]) -> ModelVersion | None:
@@ -178,13 +299,15 @@ def adopt(
     force: bool = False,
     reason: str | None = None,
     shown: int | None = None,
+    ends: Ends | None = None,
 ) -> ModelRow:
     """Adopt the effects of a study in a new current version.
 
     The new version has the effects that the study assumed and those that it found. This is the
     model that the study's held-out photographs evaluated, also if ``force`` replaces another
     current version. If it is current already, nothing changes. ``shown`` is the version that was
-    current when the study was read; None requires nothing.
+    current when the study was read; None requires nothing. Effects of an adopted study get their
+    ``ends`` in the next version.
 
     Raises
     ------
@@ -195,6 +318,8 @@ def adopt(
         ``force``, also if its verdict is not "effect", or if it was made with another version than
         the current one. Without a ``reason``, if the study leaves questions open
         (`open_questions`).
+    InvalidInputError
+        If ``ends`` are not of its effects.
     """
     study = store.get_study(session, number)
     found = _effects(study.report)
@@ -213,27 +338,31 @@ def adopt(
             f"version {current} of the model is current{by}, instead of {shown} when study {number}"
             " was read; read it again before you adopt it"
         )
-    if study.model != current and not force:
+    held = find_adopted(session, number)
+    is_ending = bool(ends) and held is not None
+    if study.model != current and not force and not is_ending:
         raise ConflictError(
             f"study {number} was made with version {study.model} of the model, {current} is"
             " current; make another study, or force it to put this one in place of the current"
             " model"
         )
-    held = find_adopted(session, number)
-    if held is not None and held.number == current:
+    if held is not None and held.number == current and not is_ending:
         return held
     questions = open_questions(study.report["effects"], study.report["unexplained_share"])
-    if questions and not reason:
+    if questions and not reason and not is_ending:
         raise ConflictError(
             f"reason: study {number} leaves questions open"
             f" ({'; '.join(question.finding for question in questions)}); resolve them, or give the"
             " reason to adopt it nevertheless"
         )
-    base = _row(session, study.model)
-    row = add_model(session, _with_found(base, study), declared_of(session, base), study.id, actor)
+    next_ = _next_model(session, study, ends or {})
+    declared = declared_of(session, next_.base)
+    row = add_model(session, next_.effects, declared, study.id, actor)
     row.reason = reason
     names = [effect.name for effect in found]
-    about = {"model": row.version, "effects": names, **_given(reason)}
+    until = {key: day.isoformat() for key, day in (ends or {}).items()}
+    about: dict[str, object] = {"model": row.version, "effects": names, **_given(reason)}
+    about |= {"until": until} if until else {}
     audit.record(session, actor, "effect.adopted", f"study {number}", **about)
     return row
 

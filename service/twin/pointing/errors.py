@@ -1,7 +1,7 @@
 """Pointing errors of heliostats: their size, their trend, and moves.
 
-The errors of calibration photographs are those stored with the mount. Later photographs are
-compared with the mount that is valid now.
+Photographs of the calibration are forecast by those of other days: the fit's residuals are far
+smaller than errors of forecasts. Later photographs are compared with the mount that is valid now.
 """
 
 import logging
@@ -15,6 +15,8 @@ from sqlalchemy.orm import Session, undefer
 
 from model.errors import ModelError
 from model.pointing import Reading, pointing_error
+from model.pointing.mounts import PredictedError
+from model.pointing.prediction import MIN_MEASUREMENTS
 from model.pointing.report import moment_of
 from model.pointing.spots import spot_covariance
 from model.times import format_minute
@@ -85,7 +87,10 @@ class PointingState:
     calibrated_at : datetime
     error_mrad : float or None [mrad]
         Median angle at the mirror between forecast and measured spots, over the newest photographs
-        since the last move.
+        since the last move. Those of the calibration are forecast by others. None below
+        `MIN_MEASUREMENTS` photographs, or if too many contradict the mount.
+    interval_mrad : pair of float or None [mrad]
+        Interval of 90 % of such angles.
     photographs, since_calibration : int
         Number of photographs in this median, and number of all photographs since the calibration.
     trend_mrad : float or None [mrad]
@@ -108,6 +113,7 @@ class PointingState:
     beyond_since: datetime | None = None
     moved: DriveStep | None = None
     drifted: PointingDrift | None = None
+    interval_mrad: tuple[float, float] | None = None
 
 
 def pointing_state(
@@ -119,8 +125,8 @@ def pointing_state(
     because they may not be among the newest.
     """
     mount = stored.mount
-    is_known = ~mount.foreign & np.isfinite(mount.days)
-    days, off = mount.days[is_known], 1e3 * mount.errors_rad[is_known]
+    is_known = np.isfinite(mount.predicted) & np.isfinite(mount.days)
+    days, off = mount.days[is_known], 1e3 * mount.predicted[is_known]
     moved, begin = None, -np.inf
     if mount.steps:
         step = mount.steps[-1]
@@ -140,17 +146,27 @@ def pointing_state(
         trend = _trend(apart)
         days, off = np.concatenate([days, new_days]), np.concatenate([off, apart])
     days, off = days[days >= begin], off[days >= begin]
+    is_enough = off.size >= MIN_MEASUREMENTS and (newer or mount.prediction is not None)
+    error = float(np.median(off[-NEWEST:])) if is_enough else None
     return PointingState(
         mount_version=kept.version,
         calibrated_at=kept.created_at,
-        error_mrad=float(np.median(off[-NEWEST:])) if off.size else None,
+        error_mrad=error,
         photographs=min(off.size, NEWEST),
         since_calibration=len(newer),
         trend_mrad=trend,
-        beyond_since=_beyond_since(days, off, limit_mrad),
+        beyond_since=None if error is None else _beyond_since(days, off, limit_mrad),
         moved=moved,
         drifted=_drifted(kept),
+        interval_mrad=_interval(mount.prediction, error),
     )
+
+
+def _interval(predicted: PredictedError | None, error: float | None) -> tuple[float, float] | None:
+    """The interval of the calibration's prediction, in proportion to the newest ``error``."""
+    if predicted is None or error is None:
+        return None
+    return error * predicted.low / predicted.median, error * predicted.high / predicted.median
 
 
 def _forecast_errors(

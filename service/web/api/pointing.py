@@ -62,8 +62,12 @@ class PointingOut(BaseModel):
     error_mrad: float | None = Field(
         description=(
             "Median angle at the mirror between forecast and measured spots, of the newest"
-            " photographs since the heliostat last moved [mrad]."
+            " photographs since the heliostat last moved [mrad]. Photographs of the calibration are"
+            " forecast by those of other days. null for fewer than 3."
         )
+    )
+    interval_mrad: tuple[float, float] | None = Field(
+        description="Interval of 90 % of such angles [mrad]; null if unknown."
     )
     error_m: float | None = Field(
         description="The same at the nearest receiver's centre [m]; null without a receiver."

@@ -288,7 +288,7 @@ def _mount_context(mount: MountRow) -> dict[str, object]:
         ],
         **{
             name: mount.document[name]
-            for name in ("drift", "outliers", "measurements", "residual_mrad")
+            for name in ("drift", "outliers", "measurements", "predicted_error_mrad")
         },
     }
 

@@ -1,7 +1,7 @@
 """Studies: which effects the plant's model still lacks, and the decision to adopt them."""
 
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import date, datetime
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request, Response, status
@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.errors import InvalidInputError
+from model.study.judging import Gain
 from model.study.loop import MIN_IMAGES
 from service import store
 from service.base.errors import ConflictError, NotFoundError
@@ -57,6 +58,12 @@ from service.twin.studies.changes import (
     AccuracyChange,
     forecast_changes,
     heliostats_to_forecast,
+)
+from service.twin.studies.field_change import (
+    ContradictionError,
+    FieldChange,
+    read_field_change,
+    require_no_contradiction,
 )
 from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.twin.studies.study import MAX_STUDY_IMAGES, StudyIn, Surfaces, extent_of
@@ -142,6 +149,43 @@ class AdoptedOut(ModelOut):
     )
 
 
+class GainOut(BaseModel):
+    """A mean change of accuracy."""
+
+    mean: float = Field(description="Mean change of accuracy [1].")
+    ci95: tuple[float, float] = Field(description="Its 95 % interval [1].")
+
+
+class ContradictedEffectOut(BaseModel):
+    """An effect that makes photographs after its study worse."""
+
+    effect: str = Field(description="Its name, as `until` of the adoption takes it.")
+    until: date = Field(description="First day on which photographs are worse with it.")
+    can_end: bool = Field(description="Whether it can be adopted until that day.")
+    gain: GainOut = Field(description="Change of accuracy by it since that day.")
+    photographs: int = Field(description="Number of photographs since that day.")
+
+
+class FieldChangeOut(BaseModel):
+    """What the effects of a study change in forecasts of stored photographs.
+
+    A candidate is compared with the current model. An adopted one is what the current model would
+    be without its effects. Photographs are some of each day, of heliostats with a surface.
+    """
+
+    whole: GainOut = Field(description="On photographs of the whole field.")
+    n_whole: int = Field(description="Number of them.")
+    later: GainOut = Field(description="On those that came after the last one of the study.")
+    n_later: int = Field(description="Number of them.")
+    is_harmful: bool = Field(description="Whether later ones are significantly worse.")
+    contradicted: list[ContradictedEffectOut] = Field(
+        description="Effects that later photographs contradict."
+    )
+
+
+EffectEnds = dict[Text, date]
+
+
 class AdoptIn(Model):
     """How to adopt the result of a study."""
 
@@ -149,8 +193,17 @@ class AdoptIn(Model):
         default=False,
         description=(
             "Also where its verdict is not `effect`, or another version of the model is current by"
-            " now, which it then takes the place of."
+            " now, which it then takes the place of; with a reason, also where it makes photographs"
+            " after the study significantly worse."
         ),
+    )
+    until: Annotated[EffectEnds, Field(max_length=100)] = Field(
+        default={},
+        description=(
+            "Effects that ended, as `GET /v1/studies/{number}/change` names them: day of the first"
+            " photograph without each. An adopted study gets these ends in a next version."
+        ),
+        examples=[{"slope_error": "2026-06-21"}],
     )
     reason: Reason | None = Field(
         default=None,
@@ -171,14 +224,25 @@ class DecisionForm(WithdrawIn):
     """The body of a decision as a form.
 
     ``read`` is the tick below warnings, ``back`` the page to return to, and ``current`` the version
-    of the model that it showed.
+    of the model that it showed. ``ended`` are effects, each with the day of its end.
     """
 
     read: bool = False
     back: Literal["", "list"] = ""
+    ended: list[Text] = Field(default=[], max_length=100)
     current: ReadVersion = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
+
+    @property
+    def asked(self) -> AdoptIn:
+        """The body of REST."""
+        until = dict(one.rsplit(" ", 1) for one in self.ended if " " in one)
+        about = {"force": self.read, "reason": self.reason, "until": until}
+        try:
+            return AdoptIn.model_validate(about)
+        except ValidationError as error:
+            raise RequestValidationError(error.errors()) from error
 
     def return_from(self, number: int) -> Response:
         """Go back to the page."""
@@ -398,7 +462,33 @@ def get_change_page(
         study=study,
         accuracy=AccuracyChange.of(study.before.per_image, study.after.per_image),
         changes=forecast_changes(runtime, study.id),
+        field=read_field_change(runtime, study.id),
     )
+
+
+@router.get(
+    "/studies/{number}/change", responses=problems(404, 409), dependencies=[READ, COMPUTE_SLOT]
+)
+def get_study_change(number: Number, runtime: RuntimeDep) -> FieldChangeOut:
+    """Get what adoption changes in forecasts of stored photographs.
+
+    They are of the whole field, and of the time after the study. They are forecast for this
+    response. Adopting does the same, and answers 409 if `is_harmful`.
+    """
+    return _change_out(read_field_change(runtime, number))
+
+
+def _change_out(change: FieldChange) -> FieldChangeOut:
+    contradicted = [
+        from_row(ContradictedEffectOut, one, effect=one.key, gain=_gain_out(one.gain))
+        for one in change.contradicted
+    ]
+    gains = {"whole": _gain_out(change.whole), "later": _gain_out(change.later)}
+    return from_row(FieldChangeOut, change, contradicted=contradicted, **gains)
+
+
+def _gain_out(gain: Gain) -> GainOut:
+    return GainOut(mean=gain.mean, ci95=(gain.low, gain.high))
 
 
 @router.get(
@@ -428,8 +518,15 @@ def get_study_report_page(number: Number, runtime: RuntimeDep) -> HTMLResponse:
 def _adopt(
     runtime: Runtime, number: int, actor: str, asked: AdoptIn, shown: int | None = None
 ) -> AdoptedOut:
+    with runtime.database.reading() as session:
+        is_current = model_versions.is_current(session, number)
+    if not (is_current and not asked.until) and not (asked.force and asked.reason):
+        require_no_contradiction(runtime, number, asked.until)
+
     def adopt(session: Session) -> AdoptedOut:
-        row = model_versions.adopt(session, number, actor, asked.force, asked.reason, shown)
+        row = model_versions.adopt(
+            session, number, actor, asked.force, asked.reason, shown, asked.until
+        )
         outdated = {
             one.heliostat: one.version for one in store.outdated_surfaces(session, row.version)
         }
@@ -442,16 +539,19 @@ def _adopt(
     "/studies/{number}/adopt",
     status_code=status.HTTP_201_CREATED,
     responses=problems(404, 409, 413),
-    dependencies=[OPERATE],
+    dependencies=[OPERATE, COMPUTE_SLOT],
 )
 def adopt_study(
     number: Number, runtime: RuntimeDep, identity: IdentityDep, request: AdoptIn | None = None
 ) -> AdoptedOut:
-    """Adopt the result of a study. It becomes the current version of the plant model."""
+    """Adopt the result of a study. It becomes the current version of the plant model.
+
+    The response is 409 if it makes photographs after the study significantly worse.
+    """
     return _adopt(runtime, number, identity.name, request or AdoptIn())
 
 
-@pages.post("/studies/{number}/adopt", dependencies=[OPERATE])
+@pages.post("/studies/{number}/adopt", dependencies=[OPERATE, COMPUTE_SLOT])
 def post_adopt_form(
     number: Number,
     form: Annotated[DecisionForm, Form()],
@@ -461,8 +561,10 @@ def post_adopt_form(
     """Adopt the result of a study as the next plant model."""
     if form.reason and not form.read and get_study(number, runtime).open_questions:
         raise ConflictError("read: tick 'I have read this' below the warning")
-    asked = AdoptIn(force=form.read, reason=form.reason)
-    _adopt(runtime, number, identity.name, asked, form.current)
+    try:
+        _adopt(runtime, number, identity.name, form.asked, form.current)
+    except ContradictionError:  # its page shows the change, and offers what to do
+        return go_to(f"/studies/{number}/change#adopt-title")
     return form.return_from(number)
 
 

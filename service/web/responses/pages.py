@@ -119,7 +119,7 @@ def _moment(value: datetime | None) -> str | Markup:
 
 
 # Paths of pages in the words of alarms and warnings, which REST answers as they are.
-_PATH = re.compile(r"(?<![\w/])(/(?:photographs|jobs)\b(?:[^\s,;()]*\w)?)")
+_PATH = re.compile(r"(?<![\w/])(/(?:photographs|jobs|studies)\b(?:[^\s,;()]*\w)?)")
 
 
 def _linked(text: str) -> Markup:
@@ -134,7 +134,7 @@ def _link(path: str) -> Markup:
     if path.startswith("/photographs?"):
         review = path.replace("?", "/review?", 1)
         return link(path, "its photographs") + " (" + link(review, "review them") + ")"
-    return link(path, path.replace("/jobs/", "job "))
+    return link(path, path.replace("/jobs/", "job ").replace("/studies/", "study "))
 
 
 def _shown(value: Any) -> str:

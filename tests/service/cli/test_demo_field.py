@@ -1,7 +1,8 @@
 """The demonstration's field: each fault that it is made with is found."""
 
+import shutil
 from collections.abc import Callable, Iterator
-from datetime import timedelta
+from datetime import date, timedelta
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -136,6 +137,39 @@ def test_a_study_of_the_hazy_days_finds_wider_light(client: TestClient):
     assert study["verdict"] == "effect"
     (found,) = client.get(f"/v1/studies/{study['id']}").json()["effects"]
     assert found["name"] in ("sun_shape", "slope_error", "camera_blur")
+
+
+@pytest.fixture
+def changing(client: TestClient, tmp_path: Path) -> Iterator[TestClient]:
+    """A client on a copy of the store, which may change it."""
+    data = runtime_of(client).settings.data_dir
+    shutil.copytree(data, tmp_path / "data")
+    with client_on(tmp_path) as copy:
+        yield copy
+
+
+@pytest.mark.full
+def test_the_study_of_the_hazy_days_is_adopted_with_its_end_only(changing: TestClient):
+    """It saw no photograph after the haze; those that came later ask for its end."""
+    (haze,) = (fault for fault in FAULTS if fault.kind == "hazy")
+    ended = (now() - timedelta(days=haze.days[1] - 1)).date()
+    (found,) = changing.get("/v1/studies/1").json()["effects"]
+    refused = changing.post("/v1/studies/1/adopt", json={"reason": "it gains", "force": False})
+    assert refused.status_code == 409
+    change = changing.get("/v1/studies/1/change").json()
+    (contradicted,) = change["contradicted"]
+    assert abs(date.fromisoformat(contradicted["until"]) - ended) <= timedelta(days=1)
+    assert change["later"]["ci95"][1] < -0.002
+    forced = {"reason": "it gains", "force": True}
+    assert changing.post("/v1/studies/1/adopt", json=forced).status_code == 201
+    (alarm,) = (one for one in alarms_of(changing) if one["reason"] == "effect_ended")
+    assert contradicted["until"] in alarm["action"]
+    body = {"until": {found["name"]: contradicted["until"]}}
+    assert changing.post("/v1/studies/1/adopt", json=body).status_code == 201
+    assert not [one for one in alarms_of(changing) if one["reason"] == "effect_ended"]
+    gained = changing.get("/v1/studies/1/change").json()
+    assert gained["whole"]["mean"] > 0
+    assert not gained["is_harmful"]
 
 
 @pytest.mark.full

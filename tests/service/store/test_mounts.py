@@ -41,7 +41,7 @@ def test_mounts_are_found_by_the_time_they_are_valid(database: Database):
             mounts.get_mount_at(session, row, datetime(2024, 4, 1, tzinfo=UTC))
 
 
-def test_the_same_state_calibrated_again_is_no_new_version(database: Database):
+def test_each_calibration_is_a_version_also_of_the_same_state(database: Database):
     with database.writing() as session:
         store.put_plant(session, "P", ORIGIN)
         heliostat, _ = store.put_heliostat(session, "AA39", {}, (0.0, 1.0, 2.0))
@@ -51,11 +51,12 @@ def test_the_same_state_calibrated_again_is_no_new_version(database: Database):
         again = mounts.add_mount(
             session, heliostat, document("2024-05-01T00:00:00+00:00", measurements=4)
         )
-        assert again.version == 1
+        assert again.version == 2
     with database.reading() as session:
-        (row,) = mounts.list_mounts(session, store.get_heliostat(session, "AA39"), 10)
-        assert row.document["measurements"] == 4
-        assert row.created_at > row.valid_from
+        heliostat = store.get_heliostat(session, "AA39")
+        rows = mounts.list_mounts(session, heliostat, 10)
+        assert [row.document["measurements"] for row in rows] == [3, 4]
+        assert mounts.get_mount_at(session, heliostat).version == 2
 
 
 def test_states_of_all_mounts_are_told_without_their_documents(database: Database):

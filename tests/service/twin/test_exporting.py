@@ -61,7 +61,7 @@ def mount_document(moment: str) -> dict[str, Any]:
         "valid_from": moment,
         "sun": [],
         "measurements": 1,
-        "residual_mrad": {"median": 0.25, "p90": 0.5},
+        "predicted_error_mrad": {"median": None, "ci90": None, "measurements": 0},
         "parameters": {
             name: {"value": 0.0, "std": 0.01, "prior_std": 0.01, "unit": "rad"} for name in NAMES
         },
@@ -69,7 +69,7 @@ def mount_document(moment: str) -> dict[str, Any]:
         "drift": {"zeros_mrad": zeros, "std_mrad": [0.1, 0.1], "is_sure": False},
         "outliers": {},
         "covariance": np.diag([1e-4] * len(NAMES)).tolist(),
-        "history": {"at": [moment], "foreign": []}
+        "history": {"at": [moment], "foreign": [], "predicted": [None]}
         | {name: [zeros] for name in ("drift", "jitter", "stepped", "residuals")},
     }
 

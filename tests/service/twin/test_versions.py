@@ -3,6 +3,7 @@
 import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from datetime import date
 from pathlib import Path
 from typing import Any, cast
 
@@ -162,6 +163,31 @@ def test_study_that_is_adopted_by_force_again_stays_one_version(database: Databa
         assert set(pool.map(lambda _: adopt(database, first, force=True), range(8))) == {
             "4:camera_response"
         }
+
+
+def test_an_adopted_effect_gets_its_end_in_the_current_version(database: Database):
+    """Another study was adopted since; its effects stay."""
+    since = {"kind": "since", "since": "2026-06-01", "until": None, "heliostats": None}
+    first = add(database, SLOPE | {"scope": since})
+    adopt(database, first)
+    adopt(database, add(database, GAMMA, model=2))
+    with database.reading() as session:
+        adopted = model_versions.adopted_effects(session)
+    studies = {one.effect.name: one.study.id for one in adopted}
+    assert studies == {"camera_response": first + 1, "slope_error": first}
+    ends = {"slope_error": date(2026, 6, 7)}
+    with database.changing() as session:
+        row = model_versions.adopt(session, first, "tester", ends=ends)
+        assert row.version == "4:slope_error+camera_response"
+        assert [effect.get("scope") for effect in row.effects] == [
+            since | {"until": "2026-06-07"},
+            None,
+        ]
+    with database.reading() as session:
+        assert [a.effect.name for a in model_versions.adopted_effects(session)] == [
+            "camera_response"
+        ]
+        assert audit.entries(session, 1)[0].detail["until"] == {"slope_error": "2026-06-07"}
 
 
 def test_study_that_found_nothing_is_not_adopted(database: Database):

@@ -251,7 +251,7 @@ def test_mounts_hold_under_the_sun_they_were_calibrated_under(
     calibrate(client)
     mount = client.get("/v1/heliostats/AA39/mounts/current").json()
     assert mount["sun"] == slow["effects"]
-    assert mount["residual_mrad"]["median"] < 0.5
+    assert mount["predicted_error_mrad"]["median"] < 1
 
     np.testing.assert_allclose(sent(client, operations, heliostat), [0, 0], atol=0.02)
 

@@ -69,7 +69,7 @@ def test_an_import_without_times_invents_no_steps(imported: TestClient):
         mount = imported.get(f"/v1/heliostats/{name}/mounts/current").json()
         assert mount["valid_from"] is None
         assert not mount["drift"]["is_sure"]
-        assert mount["residual_mrad"]["median"] < 3
+        assert mount["predicted_error_mrad"]["median"] < 3
         pointing = imported.get(f"/v1/heliostats/{name}/pointing").json()
         assert (pointing["error_mrad"], pointing["moved"]) == (None, None)
         assert "none of which has a time" in imported.get(f"/heliostats/{name}", headers=HTML).text
