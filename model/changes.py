@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ _SIGMAS = np.geomspace(0.6, 1.8, 4)  # standard deviations of the noise, over th
 _FREQUENCY = 0.02  # prior probability of a change between two photographs
 _OUTLIERS, _WIDE = 0.05, 8.0  # share of days that are outliers, and their standard deviation
 _BREAK = timedelta(hours=6)  # between photographs of two days, in any time zone
-_LARGEST = 48  # photographs, the newest
+_FEWEST, _LARGEST = 6, 48  # photographs that give an estimate of the noise, and that count
 _OF_DIFFERENCE = 1.0483  # standard deviation over the median absolute difference of neighbours
 _NORMAL95 = 1.96
 
@@ -67,6 +68,11 @@ class Change:
         """Lower limit (95 % interval) of the drop; negative if the level may have risen."""
         return self.before - self.after - _NORMAL95 * self.error
 
+    @property
+    def max_drop(self) -> float:
+        """Upper limit (95 % interval) of the drop."""
+        return self.before - self.after + _NORMAL95 * self.error
+
 
 def find_changes(
     times: Sequence[datetime], values: Sequence[float], sigma: float | None = None
@@ -74,7 +80,7 @@ def find_changes(
     """Find the changes of a series that are at least `CERTAIN`, in order of time.
 
     ``times`` (n,) are in ascending order, of ``values`` (n,) whose noise has the standard deviation
-    ``sigma``. It is estimated if it is None. Only the newest `_LARGEST` count.
+    ``sigma``. It is estimated if it is None, from at least `_FEWEST`. The newest `_LARGEST` count.
 
     Of simulated series of 12 to 48 photographs without a change, at most 3 % have one, for normal
     noise and for Student's t of three degrees of freedom. A test holds this.
@@ -82,7 +88,7 @@ def find_changes(
     n = len(values)
     skipped = max(n - _LARGEST, 0)
     times, series = times[skipped:], np.asarray(values[skipped:], dtype=np.float64)
-    if len(series) < 3 or np.ptp(series) == 0:
+    if len(series) < (_FEWEST if sigma is None else 2) or np.ptp(series) == 0:
         return []
     days = np.cumsum([0, *(b - a > _BREAK for a, b in pairwise(times))])
     sigmas = _noise(series) * _SIGMAS if sigma is None else np.array([sigma])
@@ -113,6 +119,13 @@ def _noise(series: Array) -> float:
     return max(spread, 1e-3 * float(np.ptp(series)))
 
 
+class _Level(NamedTuple):
+    """Mean and standard deviation of a level."""
+
+    mean: float
+    error: float
+
+
 @dataclass(frozen=True, eq=False)
 class _Segments:
     """Likelihoods of all segments of a series.
@@ -133,12 +146,12 @@ class _Segments:
             np.exp(split - np.logaddexp(logsumexp(split), self.likelihood[begin, end]))
         )
 
-    def level(self, begin: int, end: int) -> tuple[float, float]:
-        """Mean and standard deviation of the level of a segment."""
+    def level(self, begin: int, end: int) -> _Level:
+        """The level of a segment."""
         weights = np.exp(self.of_levels[begin, end] - self.of_levels[begin, end].max())
         weights /= weights.sum()
         mean = float(weights @ self.grid)
-        return mean, float(np.sqrt(weights @ (self.grid - mean) ** 2))
+        return _Level(mean, float(np.sqrt(weights @ (self.grid - mean) ** 2)))
 
 
 _PRIOR = float(np.log(_FREQUENCY / (1 - _FREQUENCY)))

@@ -5,7 +5,7 @@ of that spot is half the logarithm of det(S + R) / det(R): high if the mount is 
 it is known. Source: Lindley 1956, doi:10.1214/aoms/1177728069.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -51,12 +51,13 @@ def plan(
     planes: Sequence[TargetPlane],
     suns: Sequence[Array],
     days: Sequence[float],
+    wanted: Collection[str] = (),
 ) -> list[Proposal]:
     """Propose the most informative photograph for each of the ``suns`` (3,), at ``days`` [d].
 
-    A heliostat is proposed once at most. All heliostats are evaluated under the middle sun, on the
-    first of ``planes`` that they reach. The most informative of them, two per sun, are evaluated on
-    every plane and under every sun.
+    A heliostat is proposed once at most, and those ``wanted`` before others. All heliostats are
+    evaluated under the middle sun, on the first of ``planes`` that they reach. The most informative
+    of them, two per sun, are evaluated on every plane and under every sun.
     """
     middle = len(suns) // 2
     first = [
@@ -64,7 +65,8 @@ def plan(
         for name, mount in mounts.items()
     ]
     promising = sorted(
-        (one for one in first if one is not None), key=lambda one: -one.information_bits
+        (one for one in first if one is not None),
+        key=lambda one: (one.heliostat not in wanted, -one.information_bits),
     )
     names = [one.heliostat for one in promising[: 2 * len(suns)]]
     slots = range(len(suns))
@@ -76,7 +78,9 @@ def plan(
     chosen: dict[str, Proposal] = {}
     for slot in slots:
         left = [one for one in offers if one.slot == slot and one.heliostat not in chosen]
-        best = max(left, key=lambda one: one.information_bits, default=None)
+        best = max(
+            left, key=lambda one: (one.heliostat in wanted, one.information_bits), default=None
+        )
         if best is not None:
             chosen[best.heliostat] = best
     return list(chosen.values())

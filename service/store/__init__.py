@@ -78,6 +78,7 @@ from service.store.surfaces.surface_versions import (
     get_surface_at,
     list_surfaces,
     newest_prediction,
+    next_epoch,
     outdated_surfaces,
 )
 
@@ -133,6 +134,7 @@ __all__ = [
     "list_surfaces",
     "list_targets",
     "newest_prediction",
+    "next_epoch",
     "outdated_surfaces",
     "put_heliostat",
     "put_plant",

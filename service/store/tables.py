@@ -297,6 +297,8 @@ class SurfaceRow(Base):
     - ``content_sha256`` is set if the same content must not be stored twice (imports). Predictions
       leave it empty.
     - ``valid_from`` is None if its start is unknown: measured surfaces, photographs without a time.
+    - ``epoch_since`` is when the epoch of the mirror began that it describes, None if it never
+      changed: photographs from before show another shape (`service.twin.surfaces.epochs`).
     - ``is_candidate``: a candidate is never active (`service.store.surfaces.decisions`).
     - ``model`` names the network weights, ``model_version`` the plant's model with its effects.
     - ``trusted``, ``warnings`` (sentences), ``warned_since``, ``acknowledged_at`` and
@@ -320,6 +322,7 @@ class SurfaceRow(Base):
     version: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
     valid_from: Mapped[datetime | None]
+    epoch_since: Mapped[datetime | None]
     source: Mapped[str] = mapped_column(String(16))
     model: Mapped[str | None] = mapped_column(String(128))
     model_version: Mapped[str | None] = mapped_column(String(MODEL_VERSION))
@@ -405,10 +408,6 @@ class DriftRow(Base):
 
     - ``poor_since`` is the first of the latest consecutive photographs below the accuracy limit of
       the settings.
-    - ``recent`` and ``earlier`` are medians of the accuracies on arrival: of the newest photographs
-      and of those before.
-    - ``min_drop`` is the lower bound (95 %) of the drop between both.
-    - ``fell_since`` is when the drop first exceeded the limit of the settings.
     """
 
     __tablename__ = "drift"
@@ -421,10 +420,6 @@ class DriftRow(Base):
     taken_at: Mapped[datetime]
     accuracy: Mapped[float]
     poor_since: Mapped[datetime | None]
-    recent: Mapped[float | None]
-    earlier: Mapped[float | None]
-    min_drop: Mapped[float | None]
-    fell_since: Mapped[datetime | None]
 
 
 class HeliostatStateRow(Base):
@@ -434,6 +429,8 @@ class HeliostatStateRow(Base):
 
     - ``surface_id`` is the surface of ``deviation_mm`` and ``uncertainty_mm``.
     - ``accuracy`` is the mean over ``held_out`` photographs [1]; None if there are none.
+    - ``accuracies`` [1] are those of the active surface on the newest photographs, by their row
+      ids, under ``series_key``. ``fall`` is a `service.twin.surfaces.epochs.AccuracyFall` of them.
     - ``pointing`` is a `service.twin.pointing.errors.PointingState`.
     """
 
@@ -449,6 +446,9 @@ class HeliostatStateRow(Base):
     accuracy_key: Mapped[str | None] = mapped_column(String(200))
     accuracy: Mapped[float | None]
     held_out: Mapped[int | None]
+    series_key: Mapped[str | None] = mapped_column(String(200))
+    accuracies: Mapped[dict[str, float] | None]
+    fall: Mapped[dict[str, object] | None]
     pointing_key: Mapped[str | None] = mapped_column(String(200))
     pointing: Mapped[dict[str, object] | None]
 

@@ -51,7 +51,11 @@ class PredictionsIn(Model):
         description="How many measurements to take of each heliostat; 8 the network.",
     )
     since: Moment | None = Field(
-        default=None, description="Only measurements taken since then; null: all."
+        default=None,
+        description=(
+            "Only measurements taken since then, when the mirror changed: they judge the surface,"
+            " and an active one begins an epoch. null: since the present epoch began."
+        ),
     )
     model_version: ModelVersion = None
 

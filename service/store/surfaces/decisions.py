@@ -113,7 +113,7 @@ def decide(
     version: int,
     became_active: bool,
     actor: str,
-    reason: str,
+    grounds: Justification,
     shown: int | None = None,
 ) -> DecisionRow:
     """Make a version of a heliostat active, or keep the active one instead of this candidate.
@@ -132,7 +132,7 @@ def decide(
     if not (became_active or surface.is_candidate):
         raise ConflictError(f"version {version} of {name} is no candidate; reload the page")
     change = promote if became_active else reject
-    return change(session, heliostat, surface, actor, Justification(reason))
+    return change(session, heliostat, surface, actor, grounds)
 
 
 def _require_active(session: Session, heliostat: HeliostatRow, shown: int | None) -> None:

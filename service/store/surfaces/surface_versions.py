@@ -59,6 +59,8 @@ class NewSurface:
     misfit : float
     trust : Trust
         Of a prediction.
+    epoch_since : datetime or None
+        Since when photographs show this mirror; None if it never changed.
     """
 
     source: str
@@ -71,6 +73,7 @@ class NewSurface:
     measurements: Sequence[MeasurementRow] = field(default=())
     misfit: float | None = None
     trust: Trust | None = None
+    epoch_since: datetime | None = None
 
     @property
     def content(self) -> str:
@@ -116,6 +119,7 @@ def _surface_row(
         version=version,
         created_at=created,
         valid_from=new.valid_from,
+        epoch_since=new.epoch_since,
         source=new.source,
         model=new.model,
         model_version=new.model_version,
@@ -251,6 +255,17 @@ def find_surface_at(
         query = query.where(or_(SurfaceRow.valid_from.is_(None), SurfaceRow.valid_from <= moment))
     query = query.order_by(*newest_first()).limit(1)
     return session.scalar(query.options(undefer(SurfaceRow.arrays)))
+
+
+def next_epoch(
+    session: Session, heliostat: HeliostatRow, since: datetime | None
+) -> datetime | None:
+    """When the epoch of an active version began that follows the one ``since`` a time."""
+    begun = SurfaceRow.epoch_since
+    query = select(func.min(begun)).where(
+        SurfaceRow.heliostat_id == heliostat.id, ~SurfaceRow.is_candidate, begun > (since or EPOCH)
+    )
+    return session.scalar(query)
 
 
 def find_candidate(session: Session, heliostat: HeliostatRow) -> SurfaceRow | None:

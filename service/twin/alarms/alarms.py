@@ -24,7 +24,7 @@ from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
-from model.times import format_minute
+from model.times import format_minute, format_time
 from service.base.fields import From
 from service.base.settings import Settings
 from service.store import acknowledgements, field_state
@@ -184,7 +184,7 @@ def compute_alarms(
         *_clock(session),
         *_ended_effects(contradicted),
     ]
-    found += [*_accuracies(session, settings), *_accuracy_drops(session, settings)]
+    found += _accuracies(session, settings)
     found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
     found += [*_warned(session), *_dimmed(session, lost, settings)]
     for line in lines:
@@ -199,6 +199,7 @@ def compute_alarms(
 def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alarm]:
     if (untrusted := find_untrusted(line, at)) is not None:
         yield untrusted
+    yield from _fallen(line, settings)
     if line.pointing is not None:
         yield from _pointing(line, line.pointing, settings, at)
 
@@ -208,7 +209,7 @@ def find_untrusted(line: HeliostatOverview, at: datetime) -> Alarm | None:
     surface = line.surface or line.candidate
     if surface is None or not surface.warnings:
         return None
-    since = surface.warned_since or surface.created_at or at
+    since = surface.valid_from or surface.warned_since or surface.created_at or at
     photographs = list(surface.suspicious or ())
     which = _named(photographs)
     return Alarm(
@@ -413,26 +414,22 @@ def find_ended_accuracies(
                 begun = None
 
 
-def _accuracy_drops(session: Session, settings: Settings) -> Iterator[Alarm]:
-    """Find heliostats whose newest photographs were forecast worse than earlier ones.
-
-    The accuracies are those on arrival of each photograph.
-    """
-    allowed = settings.alarm_accuracy_drop
-    query = select(HeliostatRow.name, DriftRow).join(
-        DriftRow, DriftRow.heliostat_id == HeliostatRow.id
+def _fallen(line: HeliostatOverview, settings: Settings) -> Iterator[Alarm]:
+    """Report a heliostat whose photographs are forecast worse since a change."""
+    fall, allowed = line.fall, settings.alarm_accuracy_drop
+    if fall is None or fall.min_drop <= allowed:
+        return
+    message = (
+        f"its accuracy fell {fall.when}: photographs since are forecast with {fall.recent:.0%},"
+        f" those before with {fall.earlier:.0%}, by the same surface; by {fall.min_drop:.0%} at"
+        f" least, and {allowed:.0%} is allowed"
     )
-    for name, row in session.execute(query.where(DriftRow.min_drop > allowed)):
-        since, drop = row.fell_since or row.taken_at, row.min_drop or 0.0
-        message = (
-            f"its newest photographs were forecast with an accuracy of {row.recent:.0%} in the"
-            f" median when they came, {row.earlier:.0%} before; by {drop:.0%} at least, and"
-            f" {allowed:.0%} is allowed"
-        )
-        action = "look for what changed on its mirror, and predict its surface again"
-        yield Alarm(
-            "fell", name, since, message, action, _fingerprint(since, drop / max(allowed, 1e-6))
-        )
+    action = (
+        "look for what changed on its mirror, and predict its surface from photographs since"
+        f" {format_time(fall.until)} (POST /v1/jobs/predictions with since)"
+    )
+    size = fall.min_drop / max(allowed, 1e-6)
+    yield Alarm("fell", line.name, fall.until, message, action, _fingerprint(fall.until, size))
 
 
 def _dimmed(
@@ -447,9 +444,10 @@ def _dimmed(
             "dimmed",
             names[lost.heliostat],
             lost.since,
-            f"its newest {lost.photographs} photographs on {lost.target} have {lost.share:.0%} less"
-            f" light than before, compared with other heliostats on the same days; by"
-            f" {lost.min_share:.0%} at least, and {settings.alarm_light_loss:.0%} is allowed",
+            f"since {lost.when} its {lost.photographs} photographs on {lost.target} have"
+            f" {lost.share:.0%} less light than before, compared with other heliostats on the same"
+            f" days; by {lost.min_share:.0%} at least, and {settings.alarm_light_loss:.0%} is"
+            " allowed",
             "look whether its mirror is dirty, covered or broken, and whether others shade it",
             _fingerprint(lost.since, lost.min_share / settings.alarm_light_loss),
         )

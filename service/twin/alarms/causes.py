@@ -2,31 +2,32 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import date, datetime, timedelta
-from datetime import time as clock
+from datetime import date, datetime
 from statistics import median
 from typing import Annotated, Literal, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
 from pydantic import ConfigDict, Field, computed_field
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.frames import sun_direction
 from model.times import format_minute
 from service import store
 from service.base.settings import Settings
+from service.store import acknowledgements
+from service.store.job_tables import AcknowledgementRow, AlarmRow
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
     DriftRow,
     HeliostatRow,
-    MeasurementRow,
     StudyRow,
     SurfaceRow,
 )
 from service.twin.alarms.field_overview import HeliostatOverview
+from service.twin.alarms.reasons import Reason
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.outliers import list_outliers
 from service.twin.plant import model_versions
@@ -36,31 +37,66 @@ from service.twin.surfaces.accuracy import (
     photographs_of_surface,
     rank_of,
 )
+from service.twin.surfaces.epochs import (
+    AccuracyFall,
+    DayOfOthers,
+    Epoch,
+    current_epoch,
+    fell_with_others,
+    others_on,
+    read_fall,
+)
 
 CauseKind = Literal[
-    "clock", "mirror", "foreign_light", "haze", "moved", "few_suns", "model", "times_unknown"
+    "no_surface",
+    "clock",
+    "mirror",
+    "foreign_light",
+    "haze",
+    "moved",
+    "soiled",
+    "few_suns",
+    "model",
+    "no_photograph",
+    "times_unknown",
 ]
 
 CAUSES: dict[CauseKind, str] = {
+    "no_surface": "No surface is active",
     "clock": "Wrong sun or clock",
     "mirror": "The mirror changed",
     "foreign_light": "Another heliostat's light, a shadow or a cloud",
     "haze": "Haze, or the camera",
     "moved": "It moved",
+    "soiled": "Dirty, covered or shaded",
     "few_suns": "Too few suns",
     "model": "The model lacks something",
+    "no_photograph": "No recent photograph",
     "times_unknown": "Haze and clock not checked",
 }
 """All causes with their labels; of equal shares the first is the likelier one."""
 
+_OF_ALARM: dict[Reason, tuple[CauseKind, ...]] = {
+    "moved": ("moved",),
+    "pointing": ("moved",),
+    "drift": ("moved",),
+    "accuracy": ("model", "mirror", "haze", "foreign_light", "clock", "no_surface", "few_suns"),
+    "fell": ("haze", "mirror"),
+    "dimmed": ("soiled",),
+    "untrusted": ("model", "mirror", "foreign_light", "few_suns", "no_surface", "clock"),
+    "unlike_heliostat": ("foreign_light",),
+    "sun_contradicts_time": ("clock",),
+    "no_photograph": ("no_photograph",),
+    "times_unknown": ("times_unknown",),
+}
+"""Causes that explain an alarm. Without any the first one is added, with the alarm's message."""
+
 # Newest photographs that are looked at.
 _NEWEST = 32
-# Drop of accuracy [1] that makes a photograph of the day worse than usual.
-_DROP = 0.05
-# Photographs of other heliostats that a hazy day needs.
-_MIN_OTHERS = 2
 # Suns that a prediction takes; fewer than `_FEW` are too few, and so is a span below `_SPAN_DEG`.
 _SUNS, _FEW, _SPAN_DEG, _SAME_SUN_DEG = 8, 4, 20.0, 5.0
+# Least share of a fall that is dated and certain, and that of an alarm that nothing else explains.
+_DATED, _OF_OPEN_ALARM = 0.9, 0.5
 # Misfit relative to the field's median, above which the model or the mirror is unusual.
 _MISFIT_RATIO = 1.5
 
@@ -93,30 +129,12 @@ class StudyFinding(NamedTuple):
     said: str
 
 
-class Fall(NamedTuple):
-    """A surely lower accuracy [1] since a photograph: the median of the newest, and before."""
-
-    since: datetime
-    recent: float
-    earlier: float
-
-
-@dataclass(frozen=True)
-class DayOfOthers:
-    """Photographs of other heliostats on a day: number, heliostats, accuracy [1], usual one [1]."""
-
-    photographs: int
-    heliostats: int
-    accuracy: float
-    usual: float
-
-
 @dataclass(frozen=True)
 class HeliostatFacts:
     """What the store knows of a heliostat, as `rank_causes` needs it.
 
     ``study`` is the newest study's sentence about what the model lacks. ``usual_misfit`` [1] is the
-    median of the field's active surfaces.
+    median of the field's active surfaces. ``alarms`` are the messages of its open alarms.
     """
 
     limit: float
@@ -128,17 +146,18 @@ class HeliostatFacts:
     misfit: float | None = None
     usual_misfit: float | None = None
     study: StudyFinding | None = None
-    fall: Fall | None = None
+    fall: AccuracyFall | None = None
+    epoch: Epoch | None = None
+    alarms: Mapping[Reason, str] = field(default_factory=dict)
 
     def since_fall(self) -> list[PhotographFacts]:
         """Photographs since the accuracy fell, unless that of other heliostats fell then, too."""
         if self.fall is None:
             return []
-        since = self.fall.since
+        since = self.fall.until
         found = [one for one in self.photographs if one.taken_at and one.taken_at >= since]
-        days = {one.taken_at.date() for one in found if one.taken_at} & self.others.keys()
-        fell = [self.others[day].usual - self.others[day].accuracy >= _DROP for day in days]
-        return [] if fell and 2 * sum(fell) >= len(fell) else found
+        days = [one.taken_at.date() for one in found if one.taken_at]
+        return [] if fell_with_others(days, self.others) else found
 
 
 @dataclass(frozen=True)
@@ -203,7 +222,9 @@ def outlier_reasons(facts: HeliostatFacts) -> dict[str, str]:
             said.append(str(found["detail"]))
         if one.identifier in facts.suspicious:
             said.append("the surface does not explain it, although it was made from it")
-        if one.accuracy is not None and (one.identifier in far or one.accuracy < facts.limit):
+        is_far = one.accuracy is not None and (one.identifier in far or one.accuracy < facts.limit)
+        if is_far and facts.line.surface is not None:  # the ideal mirror proves nothing of them
+            assert one.accuracy is not None
             said.append(
                 f"it is forecast with an accuracy of {percent(one.accuracy)}, the others with"
                 f" {percent(usual)} in the median"
@@ -218,6 +239,7 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
     """Rank the causes by the share of the poor photographs that they explain, the largest first."""
     poor = outlier_reasons(facts)
     found = [
+        *_no_surface(facts),
         *_clock(facts, poor),
         *_mirror(facts, poor),
         *_foreign_light(facts, poor),
@@ -230,8 +252,26 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
     if undated and not any(one.kind in ("clock", "haze") for one in found):
         said = f"the times of {undated} of {count_photographs(len(facts.photographs))} are unknown"
         found.append(LikelyCause("times_unknown", 0.0, said))
+    for reason, said in facts.alarms.items():
+        kinds = _OF_ALARM.get(reason, ())
+        if kinds and not any(one.kind in kinds for one in found):
+            found.append(LikelyCause(kinds[0], _OF_OPEN_ALARM, said))
     order = list(CAUSES)
     return sorted(found, key=lambda one: (-one.explained_share, order.index(one.kind)))
+
+
+def _no_surface(facts: HeliostatFacts) -> list[LikelyCause]:
+    """That forecasts are those of the ideal mirror."""
+    if facts.line.surface is not None or not facts.photographs:
+        return []
+    known = [one.accuracy for one in facts.photographs if one.accuracy is not None]
+    with_accuracy = f" with {percent(median(known))} in the median" if known else ""
+    said = (
+        f"the ideal mirror forecasts its {count_photographs(len(facts.photographs))}{with_accuracy}"
+    )
+    if facts.line.candidate is not None:
+        said = f"{said}; version {facts.line.candidate.version} is a candidate only"
+    return [LikelyCause("no_surface", 1.0, said)]
 
 
 def _of_photographs(
@@ -253,27 +293,26 @@ def _clock(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
 
 
 def _mirror(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
-    """An accuracy that fell at a date, when that of others did not."""
-    since = facts.since_fall()
-    if facts.fall is None or not since:
+    """A change of the mirror's shape that no surface has confirmed yet."""
+    epoch = facts.epoch
+    if epoch is None or epoch.is_confirmed:
         return []
-    others = [
-        facts.others[d]
-        for d in {one.taken_at.date() for one in since if one.taken_at}
-        if d in facts.others
+    names = tuple(
+        one.identifier
+        for one in facts.photographs
+        if one.taken_at is not None and one.taken_at >= epoch.since
+    )
+    share = max(_DATED, len(set(names) & poor.keys()) / max(len(poor), 1))
+    return [
+        LikelyCause(
+            "mirror",
+            share,
+            f"{epoch.said}; {epoch.needs}",
+            names,
+            study=epoch.study,
+            since=epoch.since,
+        )
     ]
-    kept = (
-        f"{sum(one.photographs for one in others)} photographs of others kept theirs"
-        if others
-        else "no photographs of others then to compare"
-    )
-    said = (
-        f"its forecasts are surely worse since {format_minute(facts.fall.since)}:"
-        f" {percent(facts.fall.earlier)} before, {percent(facts.fall.recent)} in the median; {kept}"
-    )
-    names = tuple(one.identifier for one in since)
-    share = max(0.5, len(set(names) & poor.keys()) / max(len(poor), 1))
-    return [LikelyCause("mirror", share, said, names, since=facts.fall.since)]
 
 
 def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[LikelyCause]:
@@ -314,11 +353,7 @@ def _hazy_days(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[date]:
         if one.identifier in poor and one.taken_at is not None:
             day = one.taken_at.date()
             other = facts.others.get(day)
-            if (
-                other is not None
-                and other.photographs >= _MIN_OTHERS
-                and other.usual - other.accuracy >= _DROP
-            ):
+            if other is not None and other.is_worse:
                 counts[day] = counts.get(day, 0) + 1
     return sorted(counts, key=lambda day: (-counts[day], day))
 
@@ -442,35 +477,39 @@ def read_facts(
         for one in recent
     ]
     drift = session.get(DriftRow, row.id)
-    fall = _fall(drift, settings)
+    fall, epoch = (read_fall(session, row.id, settings), current_epoch(session, row, settings))
+    is_candidate = epoch is not None and not epoch.is_confirmed
     accuracies = [rank_of(comparisons).accuracy, None if drift is None else drift.accuracy]
     is_below = any(one is not None and one < settings.alarm_accuracy for one in accuracies)
     has_warnings = any(one.warnings for one in photographs)
-    if not (is_below or fall or has_warnings or _has_alarm(line)):
+    alarms = _open_alarms(session, row.name)
+    is_ideal = line.surface is None and bool(photographs)
+    is_bad = is_below or fall or is_candidate or has_warnings or is_ideal or alarms
+    if not (is_bad or _has_alarm(line)):
         return None
     days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
     return HeliostatFacts(
         settings.alarm_accuracy,
         photographs,
         line,
-        {
-            day: found
-            for day in days
-            if (found := _others_on(session, row.id, day, zone)) is not None
-        },
+        others_on(session, row.id, days, zone),
         () if surface is None else tuple(surface.suspicious or ()),
         None if surface is None else surface.sun_span_deg,
         None if surface is None else surface.misfit,
         _usual_misfit(session),
         _study(session, row.name),
         fall,
+        epoch,
+        alarms,
     )
 
 
-def _fall(drift: DriftRow | None, settings: Settings) -> Fall | None:
-    if drift is None or (drift.min_drop or 0.0) <= settings.alarm_accuracy_drop:
-        return None
-    return Fall(drift.fell_since or drift.taken_at, drift.recent or 0.0, drift.earlier or 0.0)
+def _open_alarms(session: Session, heliostat: str) -> dict[Reason, str]:
+    """Messages of a heliostat's open alarms that nobody acknowledged, by reason."""
+    query = acknowledgements.open_with_acknowledgements(AlarmRow.reason, AlarmRow.message)
+    query = query.join(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
+    query = query.where(HeliostatRow.name == heliostat, AcknowledgementRow.id.is_(None))
+    return {row.reason: row.message for row in session.execute(query)}
 
 
 def _has_alarm(line: HeliostatOverview) -> bool:
@@ -481,26 +520,6 @@ def _has_alarm(line: HeliostatOverview) -> bool:
         or (pointing is not None and pointing.beyond_since is not None)
         or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)
     )
-
-
-def _others_on(session: Session, heliostat: int, day: date, zone: ZoneInfo) -> DayOfOthers | None:
-    """Compare other heliostats' accuracies on arrival of a day with their usual ones."""
-    begin, end = (datetime.combine(day + timedelta(n), clock(), zone) for n in (0, 1))
-    row = MeasurementRow
-    is_other = (row.heliostat_id != heliostat, row.accepted, row.forecast_accuracy.is_not(None))
-    is_of_day = row.taken_at.between(begin, end)
-    query = select(row.heliostat_id, row.forecast_accuracy).where(*is_other, is_of_day)
-    found = session.execute(query.limit(_NEWEST)).all()
-    if len(found) < _MIN_OTHERS:
-        return None
-    of = {number for number, _ in found}
-    usual = select(func.avg(row.forecast_accuracy)).where(
-        row.heliostat_id.in_(of), *is_other, ~is_of_day
-    )
-    mean = session.scalar(usual)
-    if mean is None:
-        return None
-    return DayOfOthers(len(found), len(of), median(value or 0.0 for _, value in found), mean)
 
 
 def _usual_misfit(session: Session) -> float | None:

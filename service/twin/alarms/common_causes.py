@@ -6,7 +6,7 @@ knows of that time is evidence of its cause. Bursts with the same evidence have 
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby
@@ -34,6 +34,7 @@ from service.twin.alarms.reasons import REASONS, Reason
 MIN_ALARMS = 5
 """Smallest number of alarms in a burst."""
 
+_MIN_SAME_CLOCK = 3  # heliostats whose photographs one wrong clock explains
 _WINDOW = timedelta(days=1)
 _LEAST_RATIO = 5.0  # of a burst's alarms to those that begin on another day
 _LEAST_DAYS = 30.0  # over which the other alarms are counted at least
@@ -93,7 +94,10 @@ def find_common_causes(
 ) -> list[CommonCause]:
     """Find bursts among ``alarms`` that nobody acknowledged, the largest first."""
     opened = [alarm for alarm in alarms if alarm.acknowledged_by is None]
-    found = [
+    clocks = _same_clocks(session, opened)
+    explained = {alarm.key for one in clocks for alarm in one.members}
+    opened = [alarm for alarm in opened if alarm.key not in explained]
+    found = clocks + [
         CommonCause(burst, tuple(_evidence(session, burst, opened, settings)))
         for reason in REASONS
         for burst in find_bursts([a for a in opened if a.reason == reason and a.heliostat])
@@ -109,6 +113,29 @@ def find_common_causes(
             else same
         )
     return sorted(merged, key=lambda one: -len(one.members))
+
+
+def _same_clocks(session: Session, alarms: Sequence[Alarm]) -> list[CommonCause]:
+    """Contradictions of sun and time that one wrong clock explains, of whatever days."""
+    of = {a.heliostat: a for a in alarms if a.reason == SUN_CONTRADICTS_TIME and a.heliostat}
+    row = MeasurementRow
+    query = select(HeliostatRow.name, row.warnings).join(row, row.heliostat_id == HeliostatRow.id)
+    query = query.where(row.warnings.is_not(None), HeliostatRow.name.in_(list(of)[:_MOST_NAMES]))
+    clocks: dict[str, dict[str, Alarm]] = {}
+    for name, warnings in session.execute(query):
+        for detail in _clock_details(warnings):
+            clocks.setdefault(detail, {})[name] = of[name]
+    return [
+        CommonCause(tuple(by_name.values()), (detail,))
+        for detail, by_name in clocks.items()
+        if len(by_name) >= _MIN_SAME_CLOCK
+    ]
+
+
+def _clock_details(warnings: Sequence[Mapping[str, str]] | None) -> list[str]:
+    """What clocks explain the contradictions among warnings, in words."""
+    found = (one for one in warnings or () if one["type"] == SUN_CONTRADICTS_TIME)
+    return [said for one in found if (said := one["detail"].partition("; ")[2])]
 
 
 def find_bursts(alarms: Sequence[Alarm]) -> list[tuple[Alarm, ...]]:
@@ -198,12 +225,7 @@ def _photographs(session: Session, reason: Reason, cause: CommonCause) -> Iterat
     )
     rows = session.execute(query).all()
     if reason == SUN_CONTRADICTS_TIME:
-        clocks = {
-            warning["detail"].partition("; ")[2]
-            for *_, warnings in rows
-            for warning in warnings or ()
-            if warning["type"] == SUN_CONTRADICTS_TIME
-        }
+        clocks = {detail for *_, warnings in rows for detail in _clock_details(warnings)}
         if len(clocks) == 1:
             yield clocks.pop()
     targets = {target for target, *_ in rows}

@@ -35,7 +35,8 @@ from service.twin.plant import model_versions
 from service.twin.pointing.errors import MountKey, PointingState, find_pointing
 from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import Rank, rank_of_active, result_key
+from service.twin.surfaces.accuracy import Rank, accuracy_series, result_key
+from service.twin.surfaces.epochs import FALL, AccuracyFall
 
 Result = TypeVar("Result")
 logger = logging.getLogger("heliotwin.service")
@@ -143,6 +144,7 @@ class HeliostatOverview:
     range_m: float | None = None
     mounted: MountKey | None = None
     pointing: PointingState | None = None
+    fall: AccuracyFall | None = None
     candidate: ActiveSurface | None = None
     id: int = 0
     pending: Mapping[str, int | str] = field(default_factory=dict)
@@ -155,14 +157,15 @@ class HeliostatOverview:
         return 1e-3 * self.pointing.error_mrad * self.range_m
 
     def accuracy_key(self, model: int) -> str | None:
-        """What the accuracy is based on, under a version of the model.
+        """What the accuracy is based on, under a version of the model; None without a photograph.
 
-        None if there is no surface or no photograph to compare.
+        Without an active surface it is that of the ideal mirror.
         """
-        if self.surface is None or self.newest is None:
+        if self.newest is None:
             return None
         calibrated_at = None if self.mounted is None else self.mounted.calibrated_at
-        return result_key(self.surface.id, self.newest, self.corrected, model, calibrated_at)
+        surface = 0 if self.surface is None else self.surface.id
+        return result_key(surface, self.corrected, model, calibrated_at, self.newest)
 
 
 def _current_surfaces(
@@ -326,11 +329,14 @@ def _with_results(
     totals, pointing = None, None
     if "surface" in valid and state.deviation_mm is not None:
         totals = FieldTotals(state.deviation_mm, state.uncertainty_mm)
+    fall = None
+    if "accuracy" in valid and state.fall is not None:
+        fall = FALL.validate_python(state.fall)
     if "pointing" in valid and state.pointing is not None:
         pointing = _POINTING.validate_python(state.pointing)
     rank = Rank(state.accuracy, state.held_out or 0) if "accuracy" in valid else None
     pending = {name: key for name, key in wanted.items() if name not in valid}
-    return replace(line, figures=totals, rank=rank, pointing=pointing, pending=pending)
+    return replace(line, figures=totals, rank=rank, pointing=pointing, fall=fall, pending=pending)
 
 
 # --- results that take long to compute
@@ -361,8 +367,15 @@ def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...
 
 
 def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
-    rank = rank_of_active(runtime, line.name)
-    return rank.accuracy, rank.photographs
+    key = str(line.pending["accuracy"]).rpartition(" ")[0]  # without the newest photograph
+    with runtime.database.reading() as session:
+        state = session.get(HeliostatStateRow, line.id)
+    known = state.accuracies if state is not None and state.series_key == key else None
+    found = accuracy_series(runtime, line.name, known or {})
+    if found is None:
+        return None, 0, None, None, None
+    fall = None if found.fall is None else FALL.dump_python(found.fall, mode="json")
+    return found.rank.accuracy, found.rank.photographs, key, found.accuracies, fall
 
 
 def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
@@ -381,7 +394,11 @@ class _StoredResult(NamedTuple):
 
 _RESULTS = {
     "surface": _StoredResult("surface_id", ("deviation_mm", "uncertainty_mm"), _compute_totals),
-    "accuracy": _StoredResult("accuracy_key", ("accuracy", "held_out"), _compute_accuracy),
+    "accuracy": _StoredResult(
+        "accuracy_key",
+        ("accuracy", "held_out", "series_key", "accuracies", "fall"),
+        _compute_accuracy,
+    ),
     "pointing": _StoredResult("pointing_key", ("pointing",), _compute_pointing),
 }
 """Results of a heliostat that take long to compute."""

@@ -44,7 +44,7 @@ _BATCH_S = 1.0
 # Longest time between the time of a row and the commit that shows it.
 _COMMIT = timedelta(minutes=1)
 # Reasons that depend on results which may be pending.
-_BY_POINTING = ("moved", "pointing", "drift")
+_BY_RESULT = {"moved": "pointing", "pointing": "pointing", "drift": "pointing", "fell": "accuracy"}
 # Reasons that the next photograph ends, rather than a decision.
 _BY_PHOTOGRAPH = ("accuracy", "fell", "dimmed", "no_photograph")
 
@@ -155,7 +155,7 @@ def _write(session: Session, reading: _Reading, settings: Settings) -> None:
 
     def ended_at(key: Key, row: AlarmRow) -> datetime | None:
         line = lines.get(key.heliostat or "")
-        if key.reason in _BY_POINTING and line is not None and "pointing" in line.pending:
+        if line is not None and _BY_RESULT.get(key.reason) in line.pending:
             return None
         if (at := ends.get((key.heliostat, key.reason, row.since))) is not None:
             return at

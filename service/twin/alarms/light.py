@@ -14,8 +14,9 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from model.changes import find_changes
+from model.times import format_minute
 from service.twin.studies.camera_watch import LightReading
-from service.twin.surfaces.accuracy import RECENT_MEDIAN, accuracy_drop
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ class LostLight:
     heliostat : int
         Its row id.
     target : str
-    since : datetime
-        Of the first photograph with less light.
+    before, since : datetime
+        The last photograph before the interval of the change, and the first one after it.
     share, min_share, max_share : float [1]
         Lost share of the light, and the ends of its 95 % interval.
     photographs : int
@@ -42,11 +43,17 @@ class LostLight:
 
     heliostat: int
     target: str
+    before: datetime
     since: datetime
     share: float
     min_share: float
     max_share: float
     photographs: int
+
+    @property
+    def when(self) -> str:
+        """The times between which it lost light, in words."""
+        return f"a time between {format_minute(self.before)} and {format_minute(self.since)}"
 
 
 def find_lost_light(readings: Iterable[LightReading], allowed: float) -> list[LostLight]:
@@ -62,7 +69,7 @@ def find_lost_light(readings: Iterable[LightReading], allowed: float) -> list[Lo
         if len(of_heliostat) < _MIN_HELIOSTATS:
             continue
         for heliostat, dated in of_heliostat.items():
-            lost = _lost(heliostat, some[0].target, sorted(dated, reverse=True), limit)
+            lost = _lost(heliostat, some[0].target, sorted(dated), limit)
             if lost is not None:
                 found.append(lost)
     return found
@@ -97,17 +104,25 @@ def _medians(
 def _lost(
     heliostat: int, target: str, dated: list[tuple[datetime, float]], limit: float
 ) -> LostLight | None:
-    """The light that was lost, by times and light from the newest on; None if less than allowed."""
-    values = [value for _, value in dated]
-    recent, earlier = values[:RECENT_MEDIAN], values[RECENT_MEDIAN:]
-    if not earlier or np.median(earlier) - np.median(recent) <= limit:
-        return None  # most end here, without a bootstrap
-    drop = accuracy_drop(values)
-    if drop is None or drop.low <= limit:
+    """The light that was lost, by times and light in order of time; None if less than allowed."""
+    values = np.array([value for _, value in dated])
+    if all(_lost_at_most(values, count) <= limit for count in (2, 5)):
+        return None  # most end here, without a search
+    changes = find_changes([at for at, _ in dated], values.tolist())
+    if not changes or changes[-1].min_drop <= limit:
         return None
-    half = (drop.earlier + drop.recent) / 2
-    count = next((place for place, value in enumerate(values) if value > half), len(values))
-    sizes = drop.earlier - drop.recent, drop.low, drop.high
-    share, least, most = (-math.expm1(-size) for size in sizes)
-    count = max(count, 1)
-    return LostLight(heliostat, target, dated[count - 1][0], share, least, most, count)
+    change = changes[-1]
+    drops = (change.before - change.after, change.min_drop, change.max_drop)
+    shares = (-math.expm1(-drop) for drop in drops)
+    return LostLight(
+        heliostat, target, change.since, change.until, *shares, len(dated) - change.first
+    )
+
+
+def _lost_at_most(values: Array, count: int) -> float:
+    """Median of the earlier light minus that of the newest photographs."""
+    return (
+        float(np.median(values[:-count]) - np.median(values[-count:]))
+        if len(values) > count
+        else 0.0
+    )

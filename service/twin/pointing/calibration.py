@@ -30,6 +30,7 @@ from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.heliostats.stored_mount import load_mount, mount_of, true_sun, with_drive_zeros
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.epochs import waiting_epochs
 
 Array = NDArray[np.float64]
 
@@ -268,7 +269,8 @@ def make_plan(
     """Plan photographs at even intervals, each of the most informative heliostat.
 
     ``begin`` is by default the next full minute. Heliostats that were never calibrated are planned
-    with the prior. Of a large field only the `plan_candidates` are considered.
+    with the prior. Of a large field only the `plan_candidates` are considered. Heliostats whose
+    mirror changed come first, until enough photographs show it.
 
     Raises
     ------
@@ -283,9 +285,10 @@ def make_plan(
     with runtime.database.reading() as session:
         model = model_versions.get_model(session)
         planes = [store.target_plane(row) for row in store.list_targets(session)]
-        names = plan_candidates(
-            mounts.calibration_states(session), max(_CANDIDATES, 2 * photographs)
-        )
+        wanted = waiting_epochs(session, runtime.settings)
+        states = mounts.calibration_states(session)
+        names = plan_candidates(states, max(_CANDIDATES, 2 * photographs))
+        names = list(dict.fromkeys([*wanted, *names]))
         known = {row.name: kept for row, kept in mounts.current_mounts(session, names)}
         rows = store.get_heliostats(session, names)
     heliostats, calibrated = {}, {}
@@ -308,7 +311,7 @@ def make_plan(
     suns = [true_sun(model, sun_direction(*angle), moment) for moment, *angle in days]
     with runtime.computing("plan"):
         chosen = plan(
-            heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days]
+            heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days], wanted
         )
     return [CalibrationSlot(one, *days[one.slot]) for one in chosen]
 

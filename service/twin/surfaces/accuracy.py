@@ -6,7 +6,7 @@ the plant's model another version.
 """
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from statistics import fmean
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import bootstrap
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -23,9 +22,17 @@ from model.metrics import flux_accuracy
 from service import store
 from service.base.errors import ServiceError
 from service.base.settings import Settings
-from service.store.listing import Period
+from service.store.listing import EVER, Period
 from service.store.photographs.measurements import PREFERENCE
-from service.store.tables import DriftRow, HeliostatRow, MeasurementRow, MountRow, SurfaceRow
+from service.store.tables import (
+    SUN_CONTRADICTS_TIME,
+    UNLIKE_HELIOSTAT,
+    DriftRow,
+    HeliostatRow,
+    MeasurementRow,
+    MountRow,
+    SurfaceRow,
+)
 from service.twin.heliostats.measurements import (
     AcceptedMeasurement,
     Array,
@@ -37,6 +44,7 @@ from service.twin.heliostats.measurements import (
 from service.twin.plant import model_versions
 from service.twin.runtime.background_cache import BackgroundCache
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.epochs import AccuracyFall, epoch_of, find_accuracy_fall
 
 logger = logging.getLogger("heliotwin.service")
 RECENT = 8
@@ -91,6 +99,14 @@ def photographs_of_surface(surface: SurfaceRow | None) -> set[str]:
     )
 
 
+def photographs_of_epoch(
+    session: Session, heliostat: HeliostatRow, epoch: Period
+) -> list[MeasurementRow]:
+    """The newest photographs that may judge a surface of an epoch, newest first."""
+    most = _LOOKED_THROUGH * RECENT
+    return store.recent_measurements(session, heliostat, most, epoch.since, epoch.until)
+
+
 class HeldOutFirst(NamedTuple):
     """Photographs with arrays, the held-out ones first, and the number of those."""
 
@@ -99,10 +115,10 @@ class HeldOutFirst(NamedTuple):
 
 
 def held_out_first(
-    session: Session, heliostat: HeliostatRow, seen: Collection[str]
+    session: Session, heliostat: HeliostatRow, seen: Collection[str], epoch: Period = EVER
 ) -> HeldOutFirst:
-    """A heliostat's newest photographs; those whose names are in ``seen`` are not held out."""
-    recent = store.recent_measurements(session, heliostat, _LOOKED_THROUGH * RECENT)
+    """A heliostat's newest photographs of an epoch; those named in ``seen`` are not held out."""
+    recent = photographs_of_epoch(session, heliostat, epoch)
     unseen = [row for row in recent if photograph_name(row) not in seen]
     chosen = (unseen + [row for row in recent if photograph_name(row) in seen])[:RECENT]
     rows = store.get_measurements(
@@ -137,7 +153,12 @@ def compare(
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, name)
         rows = (
-            held_out_first(session, twin.row, photographs_of_surface(surface))[0]
+            held_out_first(
+                session,
+                twin.row,
+                photographs_of_surface(surface),
+                epoch_of(session, twin.row, surface),
+            )[0]
             if span is None
             else _in_span(session, twin.row, span)
         )
@@ -198,15 +219,52 @@ def rank_of(comparisons: Sequence[Comparison]) -> Rank:
     return Rank(fmean(unseen) if unseen else None, len(unseen))
 
 
-def rank_of_active(runtime: Runtime, heliostat: str) -> Rank:
-    """Accuracy of a heliostat's active surface; failures are logged."""
+class AccuracySeries(NamedTuple):
+    """Accuracies [1] of the active surface by row id, what they rank, and their fall."""
+
+    rank: Rank
+    fall: AccuracyFall | None
+    accuracies: dict[str, float]
+
+
+# Photographs with these warnings do not show the mirror's shape.
+_MISLEADING = (SUN_CONTRADICTS_TIME, UNLIKE_HELIOSTAT)
+
+
+def accuracy_series(
+    runtime: Runtime, name: str, known: Mapping[str, float]
+) -> AccuracySeries | None:
+    """Accuracies of a heliostat's active surface, or of the ideal mirror if none is active.
+
+    One surface and one model forecast all photographs, so a fall is no step of them. Photographs
+    that the surface was computed from do not count. ``known`` are accuracies that were computed
+    before. The result is None after a failure, which is logged.
+    """
     try:
         with runtime.database.reading() as session:
-            surface = store.get_surface_at(session, store.get_heliostat(session, heliostat))
-        return rank_of(compare(runtime, heliostat, surface))
+            twin = load_heliostat_context(session, name)
+            surface = store.find_surface_at(session, twin.row)
+            rows = photographs_of_epoch(session, twin.row, epoch_of(session, twin.row, surface))
+            names = [row.identifier for row in rows if str(row.id) not in known]
+            missing = store.get_measurements(session, twin.row, names, arrays=True)
+        compared = compare_with(runtime, twin, surface, missing) if missing else []
     except (ModelError, ServiceError) as error:
-        logger.warning("the accuracy of heliostat %s is not known: %s", heliostat, error)
-    return Rank(None, 0)
+        logger.warning("the accuracy of heliostat %s is not known: %s", name, error)
+        return None
+    found = {**known, **{str(one.measurement.id): one.accuracy for one in compared}}
+    accuracies = {str(row.id): found[str(row.id)] for row in rows}
+    used = photographs_of_surface(surface)
+    unseen = [row for row in rows if photograph_name(row) not in used]
+    newest = [accuracies[str(row.id)] for row in unseen[:RECENT]]
+    dated = sorted(
+        (row.taken_at, accuracies[str(row.id)])
+        for row in unseen
+        if row.taken_at is not None
+        and not any(one["type"] in _MISLEADING for one in row.warnings or ())
+    )
+    fall = find_accuracy_fall([at for at, _ in dated], [value for _, value in dated])
+    rank = Rank(fmean(newest) if newest else None, len(newest))
+    return AccuracySeries(rank, None if surface is None else fall, accuracies)
 
 
 def result_key(*parts: datetime | int | None) -> str:
@@ -336,43 +394,8 @@ def accuracy_on_arrival(
     return None
 
 
-@dataclass(frozen=True)
-class AccuracyDrop:
-    """Medians of recent and earlier accuracies [1], and the drop's 95 % interval."""
-
-    recent: float
-    earlier: float
-    low: float
-    high: float
-
-
-RECENT_MEDIAN = 5
-"""Newest photographs whose median is compared with that of those before, of at least as many."""
-
-_BEFORE = 60
-_DRAWS = 1000
-
-
-def accuracy_drop(accuracies: Sequence[float]) -> AccuracyDrop | None:
-    """Estimate the drop of accuracies (n,) [1], newest first; None for too few.
-
-    The interval is a bootstrap interval: Efron and Tibshirani 1993, *An Introduction to the
-    Bootstrap*, chapter 13.
-    """
-    recent = np.array(accuracies[:RECENT_MEDIAN])
-    earlier = np.array(accuracies[RECENT_MEDIAN : RECENT_MEDIAN + _BEFORE])
-    if len(earlier) < RECENT_MEDIAN:
-        return None
-    drop = bootstrap(
-        (earlier, recent), _drop, n_resamples=_DRAWS, method="percentile", rng=0
-    ).confidence_interval
-    return AccuracyDrop(
-        float(np.median(recent)), float(np.median(earlier)), float(drop.low), float(drop.high)
-    )
-
-
-def _drop(earlier: Array, recent: Array, axis: int) -> Array:
-    return np.asarray(np.median(earlier, axis=axis) - np.median(recent, axis=axis))
+# Photographs on arrival whose median is the usual accuracy, and the least number of them.
+_USUAL, _MIN_USUAL = 60, 5
 
 
 def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
@@ -387,7 +410,7 @@ def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
         row.heliostat_id == heliostat, row.accepted, row.forecast_accuracy.is_not(None)
     )
     query = query.where(row.taken_at.is_not(None)).order_by(row.taken_at.desc(), row.id.desc())
-    query = query.limit(len(PREFERENCE) * (RECENT_MEDIAN + _BEFORE))
+    query = query.limit(len(PREFERENCE) * _USUAL)
     shots: dict[str, tuple[int, float]] = {}
     for name, kind, accuracy in session.execute(query):
         shots[name] = min(
@@ -399,7 +422,7 @@ def _accuracies_on_arrival(session: Session, heliostat: int) -> list[float]:
 def usual_accuracy(session: Session, heliostat: int) -> float | None:
     """Median accuracy [1] on arrival of a heliostat's photographs; None for fewer than five."""
     accuracies = _accuracies_on_arrival(session, heliostat)
-    return float(np.median(accuracies)) if len(accuracies) >= RECENT_MEDIAN else None
+    return float(np.median(accuracies)) if len(accuracies) >= _MIN_USUAL else None
 
 
 def record_drift(
@@ -412,8 +435,7 @@ def record_drift(
     """Store an accuracy as the heliostat's newest, unless a later photograph has one.
 
     A photograph of unknown time is ignored. An accuracy below ``alarm_accuracy`` is poor, and
-    ``poor_since`` is when the current series of poor ones began. ``fell_since`` is the same for
-    drops whose lower limit exceeds ``alarm_accuracy_drop``.
+    ``poor_since`` is when the current series of poor ones began.
     """
     if measurement.taken_at is None:
         return
@@ -425,15 +447,10 @@ def record_drift(
         accuracy=accuracy,
     )
     new.poor_since = new.taken_at if accuracy < settings.alarm_accuracy else None
-    fall = accuracy_drop(_accuracies_on_arrival(session, measurement.heliostat_id))
-    if fall is not None:
-        new.recent, new.earlier, new.min_drop = fall.recent, fall.earlier, fall.low
-        new.fell_since = new.taken_at if fall.low > settings.alarm_accuracy_drop else None
     held = session.get(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held is None and store.insert(session, new):
         return
     held = held or session.get_one(DriftRow, measurement.heliostat_id, with_for_update=True)
     if held.taken_at <= new.taken_at:
         new.poor_since = new.poor_since and (held.poor_since or new.poor_since)
-        new.fell_since = new.fell_since and (held.fell_since or new.fell_since)
         session.merge(new)

@@ -16,6 +16,7 @@ from model.observation import TRUSTED_MAHALANOBIS, Observation, SurfacePredictio
 from model.progress import Progress, silent
 from service import store
 from service.base.choices import Method, require_images
+from service.base.errors import ConflictError
 from service.store import audit
 from service.store.keys import RESERVED
 from service.store.rows import lock_heliostat
@@ -33,6 +34,7 @@ from service.twin.heliostats.measurements import (
 )
 from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.surfaces.epochs import Epoch, current_epoch
 from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface
 
 # Candidates per requested image, because some may contradict the others.
@@ -65,7 +67,10 @@ class Predicted:
 
 
 class MeasurementChoice(NamedTuple):
-    """How many accepted measurements to choose, of those taken since a time if it is given."""
+    """How many accepted measurements to choose, and since when they were taken.
+
+    The default is the begin of the mirror's epoch. Another time begins an epoch.
+    """
 
     images: int = 8
     since: datetime | None = None
@@ -95,10 +100,13 @@ def compute_surface(
     require_images(method, len(measurements) if choice is None else choice.images)
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat, model_version)
+        epoch = current_epoch(session, twin.row, runtime.settings)
         if choice is not None:
-            chosen = choose_measurements(session, twin.row, *choice, spare=_SPARE)
+            begun = choice.since or _begin_of_epoch(heliostat, epoch)
+            chosen = choose_measurements(session, twin.row, choice.images, begun, spare=_SPARE)
             names = [row.identifier for row in chosen]
         else:
+            begun = None if epoch is None else epoch.since
             names = [str(one) for one in measurements]
         rows = named_measurements(session, twin.row, names)
         today = store.find_surface_at(session, twin.row)
@@ -113,7 +121,7 @@ def compute_surface(
             )
         surface = operations.predict(twin.heliostat, observations, twin.model, method, progress)
     progress(COMPARING, 0, 1)
-    new = _new_surface(twin, surface, rows)
+    new = _new_surface(twin, surface, rows, begun)
     with runtime.database.reading() as session:
         known = store.find_same_content(session, twin.row, new)
     if known is not None:
@@ -123,6 +131,19 @@ def compute_surface(
     if _is_older(new, today):
         return Predicted(twin, new)
     return Predicted(twin, new, None, evaluate_surface(runtime, twin, today, new))
+
+
+def _begin_of_epoch(heliostat: str, epoch: Epoch | None) -> datetime | None:
+    """Since when photographs show the present mirror.
+
+    Raises ConflictError if the mirror changed and too few photographs show it since.
+    """
+    if epoch is not None and epoch.missing:
+        raise ConflictError(
+            f"heliostat {heliostat}: {epoch.said}. {epoch.needs}; photograph it again, or give"
+            " `since` or `measurements`"
+        )
+    return None if epoch is None else epoch.since
 
 
 def _evaluated_first(
@@ -165,11 +186,15 @@ def choose_observations(
 
 
 def _new_surface(
-    twin: HeliostatContext, surface: SurfacePrediction, chosen: Sequence[MeasurementRow]
+    twin: HeliostatContext,
+    surface: SurfacePrediction,
+    chosen: Sequence[MeasurementRow],
+    begun: datetime | None,
 ) -> store.NewSurface:
     """The surface as it will be stored.
 
-    It is valid from the time of its newest image; None if no time is known.
+    It is valid from the time of its newest image; None if no time is known. It is of the epoch that
+    has ``begun`` if no image is from before.
     """
     used = [row for row in chosen if row.identifier in surface.used]
     return store.NewSurface(
@@ -183,7 +208,12 @@ def _new_surface(
         measurements=used,
         misfit=surface.misfit,
         trust=_trust(surface, used),
+        epoch_since=begun if all(_is_since(row, begun) for row in used) else None,
     )
+
+
+def _is_since(row: MeasurementRow, begun: datetime | None) -> bool:
+    return begun is not None and row.taken_at is not None and row.taken_at >= begun
 
 
 def _trust(surface: SurfacePrediction, used: Sequence[MeasurementRow]) -> store.Trust:

@@ -39,6 +39,7 @@ from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.evaluation import decide_by_hand
 from service.twin.surfaces.prediction import predict_surface
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -102,6 +103,12 @@ class SurfaceSummary(BaseModel):
     valid_from: datetime | None = Field(
         description=(
             "The mirror is taken to have this surface from then on; null: since when is not known."
+        )
+    )
+    epoch_since: datetime | None = Field(
+        description=(
+            "When the epoch of the mirror began that it describes: photographs from before show"
+            " another shape; null: the mirror never changed."
         )
     )
     measurements: list[str] = Field(description="Ids of the measurements that it was made from.")
@@ -371,14 +378,11 @@ def put_current_surface(
 ) -> DecisionOut:
     """Make a version the active surface. If-Match names the one that was active.
 
-    Accuracies are not compared. Versions with precedence over it become candidates.
+    Both are compared on photographs that neither has seen. Versions with precedence over it become
+    candidates.
     """
-    return runtime.database.run_in_transaction(
-        lambda session: decision_out(
-            decisions.decide(
-                session, name, choice.version, True, identity.name, choice.reason, active
-            )
-        )
+    return decision_out(
+        decide_by_hand(runtime, name, choice.version, True, identity.name, choice.reason, active)
     )
 
 

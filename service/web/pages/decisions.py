@@ -1,6 +1,6 @@
 """Forms that exclude photographs, choose the active surface, undo that, acknowledge warnings."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Form, Path, Response
 from pydantic import Field
@@ -15,7 +15,7 @@ from service.twin.photographs.corrections import (
     PhotographChanges,
     correct_photographs,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.evaluation import decide_by_hand
 from service.web.api.corrections import predict_again
 from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
@@ -38,10 +38,6 @@ class TakeForm(Model):
     active: ReadVersion = None
 
 
-def _decide(runtime: Runtime, *about: Any) -> None:
-    runtime.database.run_in_transaction(lambda session: decisions.decide(session, *about))
-
-
 @router.post("/heliostats/{name}/surfaces/{version}/take", dependencies=[OPERATE])
 def post_take_form(
     name: NamePath,
@@ -52,7 +48,7 @@ def post_take_form(
 ) -> Response:
     """Make a version the active surface."""
     reason = form.reason or f"{identity.name} chose it"
-    _decide(runtime, name, version, True, identity.name, reason, form.active)
+    decide_by_hand(runtime, name, version, True, identity.name, reason, form.active)
     return go_to(f"/heliostats/{name}#history-title")
 
 
@@ -66,7 +62,7 @@ def post_keep_form(
 ) -> Response:
     """Keep the active surface instead of a candidate."""
     reason = form.reason or f"{identity.name} kept the active surface"
-    _decide(runtime, name, version, False, identity.name, reason, form.active)
+    decide_by_hand(runtime, name, version, False, identity.name, reason, form.active)
     return go_to(f"/heliostats/{name}#history-title")
 
 

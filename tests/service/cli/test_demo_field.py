@@ -1,24 +1,35 @@
 """The demonstration's field: each fault that it is made with is found."""
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
-from datetime import date, timedelta
+from datetime import date, datetime, timedelta
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
-from service.cli.demo_field import FAULTS, Fault
+from model.metrics import flux_accuracy
+from service import store
+from service.cli.demo_field import FAULTS, Fault, _canted, plan_photographs
 from service.cli.demo_field_store import seed_field
+from service.sources.plant_file import read_plant
+from service.sources.plant_formats.imported import PLANT
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow
+from service.twin.heliostats.measurements import (
+    accepted_measurement,
+    heights_of,
+    load_heliostat_context,
+)
+from service.twin.surfaces.accuracy import forecasts_of
 from tests.conftest import made_once
 from tests.service.conftest import until
 from tests.service.exported import MEASURED_AGAIN, require_round_trip
-from tests.service.real import client_on, runtime_of
+from tests.service.real import client_on, run_job, runtime_of
 from tests.service.twin.test_causes import causes_of
 
 ROWS = 4
@@ -26,8 +37,8 @@ ROWS = 4
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    """A client on the store of a small field; it only reads."""
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store of a small field; read it only."""
 
     def make(root: Path) -> None:
         totals, steps = [], []
@@ -39,8 +50,21 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         seed_field(root / "plant", root / "data", counting, rows=ROWS)
         assert totals == [len(steps)]  # a bar ends where it says
 
-    made = made_once(tmp_path_factory, "field", make)
+    return made_once(tmp_path_factory, "field", make)
+
+
+@pytest.fixture(scope="module")
+def client(made: Path) -> Iterator[TestClient]:
+    """A client that only reads."""
     with client_on(made) as client:
+        yield client
+
+
+@pytest.fixture
+def changing(made: Path, tmp_path: Path) -> Iterator[TestClient]:
+    """A client on a copy of the store."""
+    shutil.copytree(made, tmp_path / "copy")
+    with client_on(tmp_path / "copy") as client:
         yield client
 
 
@@ -105,6 +129,67 @@ def test_forecasts_and_aims_know_the_soiled_mirror_and_the_drives_that_stepped(c
     assert result_of(client, "plans")["sources"]["cleanliness"]["measured"] >= 1
     aims = result_of(client, "aim-plans")
     assert aims["peak_p95_w_m2"] > 1.001 * aims["peak_w_m2"]
+
+
+@pytest.mark.full
+def test_from_its_alarm_to_the_right_surface_of_a_changed_mirror(changing: TestClient, made: Path):
+    """One click, or the same over REST: the surface is that of the changed mirror, by its truth."""
+    (fault,) = (fault for fault in FAULTS if fault.kind == "facet canted")
+    (name,) = fault.heliostats
+    photographs = plan_photographs(read_plant(made / "plant" / PLANT).plant, now())
+    changed = [one for one in photographs if one.mirror.name == name and fault.kind in one.faults]
+    (alarm,) = (one for one in alarms_of(changing) if one["reason"] == "fell")
+    since = datetime.fromisoformat(alarm["since"])
+    assert abs(since - changed[0].taken_at) < timedelta(days=1)
+    # The page offers the same as REST.
+    page = changing.get(f"/heliostats/{name}", headers={"Accept": "text/html"}).text
+    (offered,) = re.findall(r'name="since" value="(.*?)"', page)
+    assert datetime.fromisoformat(offered) == since
+    surfaces = f"/v1/heliostats/{name}/surfaces"
+
+    truth = _canted(changed[0])
+
+    def accuracy() -> float:
+        """Of forecasts under the suns of all photographs, by the true mirror's fluxes."""
+        runtime = runtime_of(changing)
+        with runtime.database.reading() as session:
+            twin = load_heliostat_context(session, name)
+            recent = store.recent_measurements(session, twin.row, 24)
+            names = [row.identifier for row in recent]
+            rows = store.get_measurements(session, twin.row, names, arrays=True)
+            z = heights_of(store.find_surface_at(session, twin.row))
+        photos = [accepted_measurement(row, twin.origin) for row in rows]
+        pairs = zip(*(forecasts_of(runtime, twin, photos, one) for one in (truth, z)), strict=True)
+        return fmean(flux_accuracy(*pair) for pair in pairs)
+
+    assert accuracy() < 0.85
+    made_of = {"heliostats": [name], "since": alarm["since"], "method": "refined"}
+    (judged,) = run_job(changing, "/v1/jobs/predictions", **made_of)["judged"].values()
+    assert judged["became_active"], judged
+    assert "in cross-validation" in judged["reason"]
+    assert accuracy() > 0.92
+    assert changing.get(f"{surfaces}/current").json()["epoch_since"] == alarm["since"]
+    assert "fell" not in {one["reason"] for one in alarms_of(changing) if one["heliostat"] == name}
+    # The next prediction takes photographs of the epoch only.
+    made_of = {"heliostats": [name], "method": "network"}
+    run_job(changing, "/v1/jobs/predictions", **made_of)
+    newest = changing.get(f"{surfaces}?limit=1&order=down").json()["items"][0]
+    assert newest["epoch_since"] == alarm["since"]
+
+
+@pytest.mark.full
+def test_every_alarm_has_its_cause_and_clocks_have_a_common_one(client: TestClient):
+    expected = {"dimmed": "soiled", "moved": "moved", "fell": "mirror"}
+    expected |= {"sun_contradicts_time": "clock", "no_photograph": "no_photograph"}
+    expected |= {"times_unknown": "times_unknown"}
+    for alarm in alarms_of(client):
+        if (name := alarm["heliostat"]) is not None and alarm["reason"] in expected:
+            found = client.get(f"/v1/heliostats/{name}/causes").json()["items"]
+            assert expected[alarm["reason"]] in {one["kind"] for one in found}, alarm
+    causes = client.get("/v1/alarms/causes").json()["items"]
+    (fault,) = (fault for fault in FAULTS if fault.kind == "clock")
+    (clock,) = (one for one in causes if "sun_contradicts_time" in one["alarms"])
+    assert set(clock["heliostats"]) == set(fault.heliostats)
 
 
 @pytest.mark.full

@@ -6,7 +6,9 @@ from numpy.typing import NDArray
 
 from service.twin.surfaces.evaluation import (
     MIN_HELD_OUT,
+    JudgedBy,
     Precedence,
+    begin_epoch_or_reject,
     precedence_of,
     promote_or_reject,
     promote_or_reject_first,
@@ -46,12 +48,39 @@ CHANCE = np.array([0.06, -0.05, 0.04, -0.03, 0.05, -0.02])
 def test_what_decides(
     gains: NDArray[np.float64], unseen: int, current: Precedence, candidate: Precedence, taken: bool
 ):
-    decided, reason = promote_or_reject(
-        gains[: unseen or None], unseen, current, candidate, "version 1"
-    )
+    judges = gains[: unseen or None]
+    decided, reason = promote_or_reject(judges, JudgedBy(unseen), current, candidate, "version 1")
     assert decided is taken
     assert "version 1" in reason
     assert len(reason) <= 200  # what the store keeps
+    if unseen:
+        by_parts = JudgedBy(unseen, by_parts=True)
+        decided, reason = promote_or_reject(judges, by_parts, current, candidate, "version 1")
+        assert decided is taken
+        assert "neither has seen" not in reason or unseen < MIN_HELD_OUT
+        assert len(reason) <= 200
+
+
+@pytest.mark.parametrize(
+    ("gains", "unseen", "candidate", "taken"),
+    [
+        (BETTER, 6, NETWORK, True),
+        (BETTER[:5], 5, NETWORK, True),
+        (BETTER[:4], 4, REFINED, False),  # too few to confirm it
+        (CHANCE, 6, REFINED, False),  # no change
+        (WORSE, 6, REFINED, False),
+        (BETTER, 6, UNTRUSTED, True),
+    ],
+)
+def test_an_epoch_begins_if_its_photographs_show_it(
+    gains: NDArray[np.float64], unseen: int, candidate: Precedence, taken: bool
+):
+    by = JudgedBy(unseen, by_parts=True)
+    decided, reason = begin_epoch_or_reject(gains, by, NETWORK, candidate, "version 12")
+    assert decided is taken
+    assert len(reason) <= 200
+    if unseen < MIN_HELD_OUT:
+        assert "1 more of the changed mirror" in reason
 
 
 @pytest.mark.parametrize(
@@ -74,7 +103,7 @@ def test_what_decides(
 def test_a_first_surface_is_compared_with_the_ideal_mirror(
     gains: NDArray[np.float64], unseen: int, is_trusted: bool, taken: bool
 ):
-    decided, reason = promote_or_reject_first(gains, unseen, is_trusted)
+    decided, reason = promote_or_reject_first(gains, JudgedBy(unseen), is_trusted)
     assert decided is taken
     assert "the ideal mirror" in reason
     used = len(gains) - unseen

@@ -5,8 +5,7 @@ as metrics.
 import itertools
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
-from functools import partial
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,7 +26,7 @@ from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
 from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.reasons import REASONS, Reason
-from service.twin.surfaces.accuracy import accuracy_drop
+from service.twin.surfaces.epochs import find_accuracy_fall
 from service.web.app import create_app
 from tests.service.conftest import (
     ORIGIN,
@@ -77,9 +76,9 @@ def acknowledge(client: TestClient, *found: dict[str, Any]) -> Any:
     return client.post(f"{PATH}/acknowledgements", json=body)
 
 
-def recent() -> dict[str, Any]:
-    """A time of yesterday, and the sun's position at that time."""
-    moment = (now() - timedelta(days=1)).replace(hour=11, minute=0, second=0, microsecond=0)
+def recent(days: int = 1) -> dict[str, Any]:
+    """A time some days ago, and the sun's position at that time."""
+    moment = (now() - timedelta(days=days)).replace(hour=11, minute=0, second=0, microsecond=0)
     azimuth, elevation = sun_angles_at(moment, ORIGIN)
     return {"taken_at": moment.isoformat(), "sun": sun_at(azimuth, elevation)}
 
@@ -167,39 +166,43 @@ def test_poor_forecasts_until_one_is_good_again(blind: TestClient):
 
 
 class Worn(FakeOperations):
-    """Forecasts with an accuracy of ``accuracy`` [1]."""
+    """Forecasts whose accuracy is 95 to 97 % until 6 days ago, and then 80 to 82 %."""
 
-    accuracy = 0.95
-
-    def render(self, *arguments: Any, **options: Any) -> Any:
-        shown = super().render(*arguments, **options)
+    def render(self, heliostat: Any, observations: Any, *others: Any, **options: Any) -> Any:
+        shown = super().render(heliostat, observations, *others, **options)
         elsewhere = np.zeros_like(shown)
         elsewhere[..., 0, 0] = shown.sum(axis=(-2, -1))
-        share = (1 - self.accuracy) / 2  # it is missed where it is, and too much where it is not
+        days = [(now() - one.taken_at).days for one in observations]
+        accuracies = [(0.95 if ago > 5 else 0.80) + 0.01 * (ago % 3) for ago in days]
+        # It is missed where it is, and too much where it is not.
+        share = (1 - np.array(accuracies)[:, None, None]) / 2
         return (1 - share) * shown + share * elsewhere
 
 
 def test_accuracy_that_fell_above_the_least(tmp_path: Path):
     """From 95 to 80 %: no photograph is poor, and yet the mirror changed."""
-    operations = Worn()
-    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), operations)) as client:
+    with client_of(create_app(Settings(data_dir=tmp_path, **QUIET), Worn())) as client:
         client.put("/v1/plant", json=tower_document())
         client.put("/v1/heliostats/AA39", json=properties_document())
-        post = partial(poster(client), **recent())
-        post(png(1), id="1")
+        post = poster(client)
+        post(png(1), id="1", **recent(19))
         client.post("/v1/heliostats/AA39/surfaces", json={"method": "network"})
         for number in range(2, 20):
-            operations.accuracy = (0.95 if number < 15 else 0.80) + 0.01 * (number % 3)
-            post(png(number), id=str(number))
+            post(png(number), id=str(number), **recent(20 - number))
         (item,) = items(client)
         assert item["reason"] == "fell"
-        assert "with an accuracy of 81% in the median when they came, 96% before" in item["message"]
+        said = r"fell between (\S+) .* and (\S+) .* are forecast with 81%, those before with 96%"
+        first, last = re.search(said, item["message"]).groups()
+        days = (date.fromisoformat(last) - date.fromisoformat(first)).days
+        assert days == 1
+        taken_at = datetime.fromisoformat(recent(5)["taken_at"])
+        assert abs(datetime.fromisoformat(item["since"]) - taken_at) <= timedelta(days=1)
         assert "Accuracy fell" in client.get("/alarms", headers=HTML).text
         # The heliostat's page ranks it first, with a prediction from photographs since then.
         page = client.get("/heliostats/AA39", headers=HTML).text
         (first, *_) = re.findall(r"<strong>(.*?)</strong>.*?: (.*)", page[page.index("causes") :])
         assert first[0] == "The mirror changed"
-        assert re.search(r"96\.0\s%\sbefore, 81\.0\s%\sin the median", first[1])
+        assert re.search(r"from 9\d\.\d% to 81\.\d%.*; \d photographs since show it", first[1])
         (since,) = re.findall(r'name="since" value="(.*?)"', page)
         assert datetime.fromisoformat(since) == datetime.fromisoformat(item["since"])
         form = {"heliostat": "AA39", "since": since}
@@ -207,33 +210,33 @@ def test_accuracy_that_fell_above_the_least(tmp_path: Path):
         payload = client.get(f"/v1{job.headers['location']}").json()["payload"]
         assert datetime.fromisoformat(payload["since"]) == datetime.fromisoformat(since)
         # A photograph that was excluded says nothing of the mirror.
-        for number in range(15, 20):
+        for number in range(14, 20):
             path = f"/v1/heliostats/AA39/measurements/{number}"
             assert (
                 client.patch(path, json={"reason": "a cloud", "excluded": True}).status_code == 200
             )
-        operations.accuracy = 0.95
-        post(png(20), id="20")
         assert items(client) == []
 
 
 @pytest.mark.parametrize(
-    ("newest", "before", "fell"),
+    ("accuracies", "first"),
     [
-        ([0.80, 0.81, 0.79, 0.80, 0.82], [0.95, 0.94, 0.96] * 4, True),
-        ([0.80, 0.81, 0.79, 0.80, 0.82], [0.95, 0.94, 0.96], None),  # too few before
-        ([0.93, 0.80, 0.95, 0.94, 0.93], [0.95, 0.94, 0.96] * 4, False),  # one alone
-        (
-            [0.80, 0.95, 0.70, 0.90, 0.85],
-            [0.95, 0.70, 0.85, 0.80, 0.90] * 4,
-            False,
-        ),  # they scatter so
-        ([0.95] * 5, [0.80] * 12, False),
+        ([0.95, 0.94, 0.96] * 4 + [0.80, 0.81, 0.79, 0.80, 0.82], 12),
+        ([0.95, 0.94, 0.96] * 4 + [0.80, 0.81], 12),
+        ([0.95, 0.94] + [0.80, 0.81], None),  # too few
+        ([0.95, 0.94, 0.96] * 4 + [0.80], None),  # one alone
+        ([0.95, 0.94, 0.96] * 4 + [0.80, 0.94, 0.95, 0.96], None),
+        ([0.95, 0.70, 0.85, 0.80, 0.90] * 4 + [0.80, 0.95, 0.70, 0.85], None),  # they scatter so
+        ([0.80, 0.81, 0.79] * 4 + [0.95, 0.94] * 3, None),  # it rose
+        ([0.95, 0.94, 0.96] * 3 + [0.80, 0.81] * 3 + [0.95, 0.96, 0.94] * 2, None),  # haze ended
+        ([0.95, 0.94, 0.96] * 3 + [0.80, 0.81] * 3 + [0.95, 0.96] * 3 + [0.85] * 4, 21),
     ],
 )
-def test_a_fall_is_more_than_chance(newest: list[float], before: list[float], fell: bool | None):
-    fall = accuracy_drop([*newest, *before])
-    assert (None if fall is None else fall.low > 0.05) is fell
+def test_a_fall_is_more_than_chance(accuracies: list[float], first: int | None):
+    times = [now() + timedelta(days=number) for number in range(len(accuracies))]
+    fall = find_accuracy_fall(times, accuracies)
+    assert (None if fall is None else times.index(fall.until)) == first
+    assert fall is None or fall.min_drop > 0.05
 
 
 def test_warnings_are_acknowledged_once_on_either_page(tmp_path: Path):

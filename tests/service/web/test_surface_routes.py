@@ -169,4 +169,4 @@ def test_refinement_takes_more_images_than_the_network(
     assert refused.status_code == 422
     assert "images must lie in 1 to 8 for the method network, got 11" in refused.json()["detail"]
     assert client.post(path, json={"method": "refined", "images": 11}).status_code == 201
-    assert len(operations.predictions[-1]) == 11
+    assert max(map(len, operations.predictions)) == 11  # parts of them judge the rest

@@ -1,0 +1,270 @@
+"""Epochs of a mirror: since when photographs show its present shape.
+
+A surface that was predicted from photographs since a time begins an epoch when it becomes active.
+Until then a dated fall of the accuracy, or a study's canting since a day, is a candidate. Haze and
+cameras change the forecasts of other heliostats, too, so they begin none. Soiling and drives change
+neither shape nor centred images. Photographs whose sun contradicts their time are left out.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, timedelta
+from datetime import time as clock
+from statistics import median
+from typing import Any
+from zoneinfo import ZoneInfo
+
+from pydantic import TypeAdapter
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from model.changes import find_changes
+from model.times import format_minute
+from service import store
+from service.base.settings import Settings
+from service.store.listing import Period
+from service.store.tables import (
+    HeliostatRow,
+    HeliostatStateRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+)
+from service.twin.plant import model_versions
+
+MIN_OF_EPOCH = 5
+"""Photographs of an epoch that confirm it, and that a prediction without a person needs."""
+
+DROP = 0.05
+"""Drop of accuracy [1] that makes photographs of a day worse than usual."""
+
+MIN_OTHERS = 2
+"""Photographs of other heliostats that a day of haze needs."""
+
+_OF_A_DAY = 32  # photographs of others that are read of a day
+
+
+@dataclass(frozen=True)
+class AccuracyFall:
+    """A fall of the accuracy of forecasts by one surface and one model.
+
+    Attributes
+    ----------
+    since, until : datetime
+        The last photograph before the interval of the change, and the first one after it.
+    earlier, recent : float [1]
+        Levels of the accuracy before and after it.
+    min_drop : float [1]
+        Lower limit of the drop (95 % interval).
+    """
+
+    since: datetime
+    until: datetime
+    earlier: float
+    recent: float
+    min_drop: float
+
+    @property
+    def when(self) -> str:
+        """The times between which it fell, in words."""
+        return f"between {format_minute(self.since)} and {format_minute(self.until)}"
+
+
+FALL: TypeAdapter[AccuracyFall] = TypeAdapter(AccuracyFall)
+"""A fall as JSON and back."""
+
+
+def find_accuracy_fall(
+    times: Sequence[datetime], accuracies: Sequence[float]
+) -> AccuracyFall | None:
+    """The last fall of accuracies (n,) [1] in order of time from which they have not recovered."""
+    changes = find_changes(times, accuracies)
+    for change in reversed(changes):
+        min_drop = change.min_drop - (changes[-1].after - change.after)
+        if min_drop > 0:
+            recent = changes[-1].after
+            return AccuracyFall(change.since, change.until, change.before, recent, min_drop)
+    return None
+
+
+# --- other heliostats
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DayOfOthers:
+    """Photographs of other heliostats on a day: number, heliostats, accuracy [1], usual one [1]."""
+
+    photographs: int
+    heliostats: int
+    accuracy: float
+    usual: float
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether they were forecast much worse than usual."""
+        return self.usual - self.accuracy >= DROP
+
+
+def others_on(
+    session: Session, heliostat: int, days: Iterable[date], zone: ZoneInfo
+) -> dict[date, DayOfOthers]:
+    """Compare other heliostats' accuracies on arrival of each day with their usual ones."""
+    found = ((day, _others_on(session, heliostat, day, zone)) for day in days)
+    return {day: of for day, of in found if of is not None}
+
+
+def _others_on(session: Session, heliostat: int, day: date, zone: ZoneInfo) -> DayOfOthers | None:
+    begin, end = (datetime.combine(day + timedelta(n), clock(), zone) for n in (0, 1))
+    row = MeasurementRow
+    is_other = (row.heliostat_id != heliostat, row.accepted, row.forecast_accuracy.is_not(None))
+    is_of_day = row.taken_at.between(begin, end)
+    query = select(row.heliostat_id, row.forecast_accuracy).where(*is_other, is_of_day)
+    found = session.execute(query.limit(_OF_A_DAY)).all()
+    if len(found) < MIN_OTHERS:
+        return None
+    of = {number for number, _ in found}
+    usual = select(func.avg(row.forecast_accuracy)).where(
+        row.heliostat_id.in_(of), *is_other, ~is_of_day
+    )
+    mean = session.scalar(usual)
+    if mean is None:
+        return None
+    return DayOfOthers(len(found), len(of), median(value or 0.0 for _, value in found), mean)
+
+
+def fell_with_others(days: Iterable[date], others: Mapping[date, DayOfOthers]) -> bool:
+    """Whether others were forecast worse on at least half of the days that have photographs."""
+    worse = [others[day].is_worse for day in set(days) if day in others]
+    return bool(worse) and 2 * sum(worse) >= len(worse)
+
+
+# --- of a heliostat
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """Since when photographs show a mirror's present shape.
+
+    Attributes
+    ----------
+    since : datetime
+        The first photograph of it.
+    said : str
+        What shows it, in words.
+    is_confirmed : bool
+        Whether a surface from its photographs is active.
+    photographs : int
+        Number of its photographs.
+    study : int or None
+        The study that found canting since then.
+    """
+
+    since: datetime
+    said: str
+    is_confirmed: bool
+    photographs: int
+    study: int | None = None
+
+    @property
+    def missing(self) -> int:
+        """Number of photographs that are missing to confirm it."""
+        return 0 if self.is_confirmed else max(MIN_OF_EPOCH - self.photographs, 0)
+
+    @property
+    def needs(self) -> str:
+        """How many photographs there are and how many are missing, in words."""
+        count = f"{self.photographs} photograph{'' if self.photographs == 1 else 's'} since"
+        return f"{count}, {self.missing} more needed" if self.missing else f"{count} show it"
+
+
+def current_epoch(session: Session, heliostat: HeliostatRow, settings: Settings) -> Epoch | None:
+    """The newest epoch of a mirror, a candidate or confirmed; None if it never changed."""
+    active = store.find_surface_at(session, heliostat)
+    begun = None if active is None else active.epoch_since
+    candidates = [
+        _of_fall(session, heliostat, settings),
+        _of_study(session, heliostat, _zone(session, settings)),
+    ]
+    newest = max(
+        (one for one in candidates if one is not None and (begun is None or one.since > begun)),
+        key=lambda one: one.since,
+        default=None,
+    )
+    if newest is not None or begun is None:
+        return newest
+    assert active is not None
+    said = f"version {active.version} is active, from photographs since {format_minute(begun)}"
+    return Epoch(begun, said, True, _count(session, heliostat, begun))
+
+
+def waiting_epochs(session: Session, settings: Settings) -> dict[str, Epoch]:
+    """Candidate epochs of heliostats that need more photographs, by name."""
+    fallen = select(HeliostatStateRow.heliostat_id).where(HeliostatStateRow.fall.is_not(None))
+    query = select(HeliostatRow).where(HeliostatRow.id.in_(fallen)).order_by(HeliostatRow.name)
+    found = {row.name: current_epoch(session, row, settings) for row in session.scalars(query)}
+    return {name: one for name, one in found.items() if one is not None and one.missing}
+
+
+def _zone(session: Session, settings: Settings) -> ZoneInfo:
+    return ZoneInfo(store.get_plant(session).time_zone or settings.time_zone or "UTC")
+
+
+def _of_fall(session: Session, heliostat: HeliostatRow, settings: Settings) -> Epoch | None:
+    fall = read_fall(session, heliostat.id, settings)
+    if fall is None:
+        return None
+    zone = _zone(session, settings)
+    rows = store.recent_measurements(session, heliostat, _OF_A_DAY, fall.until)
+    days = {row.taken_at.astimezone(zone).date() for row in rows if row.taken_at is not None}
+    if fell_with_others(days, others_on(session, heliostat.id, days, zone)):
+        return None
+    said = (
+        f"its accuracy by one surface fell {fall.when}, from {fall.earlier:.1%} to"
+        f" {fall.recent:.1%}, and that of others did not"
+    )
+    return Epoch(fall.until, said, False, len(rows))
+
+
+def read_fall(session: Session, heliostat: int, settings: Settings) -> AccuracyFall | None:
+    """The fall that a worker found, if it surely exceeds the limit of the settings."""
+    state = session.get(HeliostatStateRow, heliostat)
+    fall = None if state is None or state.fall is None else FALL.validate_python(state.fall)
+    return fall if fall is not None and fall.min_drop > settings.alarm_accuracy_drop else None
+
+
+def _of_study(session: Session, heliostat: HeliostatRow, zone: ZoneInfo) -> Epoch | None:
+    """Canting of this heliostat since a day, by the newest study if it is not adopted."""
+    query = select(StudyRow.id, StudyRow.report["effects"]).order_by(StudyRow.id.desc()).limit(1)
+    study = session.execute(query).one_or_none()
+    if study is None or model_versions.find_adopted(session, study[0]) is not None:
+        return None
+    day = _canting_since(study[1] or (), heliostat.name)
+    if day is None:
+        return None
+    since = datetime.combine(day, clock(), zone)
+    said = f"study {study[0]} found its facets canted since {day:%Y-%m-%d}"
+    return Epoch(since, said, False, _count(session, heliostat, since), study[0])
+
+
+def _canting_since(effects: Iterable[Mapping[str, Any]], heliostat: str) -> date | None:
+    """The day since when a study's canting acts on a heliostat, if it still does."""
+    for effect in effects:
+        scope = effect.get("scope") or {}
+        is_of = heliostat in (scope.get("heliostats") or ())
+        if effect["name"] == "facet_canting" and is_of and scope.get("kind") == "since":
+            return None if scope.get("until") else date.fromisoformat(scope["since"])
+    return None
+
+
+def _count(session: Session, heliostat: HeliostatRow, since: datetime) -> int:
+    return len(store.recent_measurements(session, heliostat, 2 * MIN_OF_EPOCH, since))
+
+
+def epoch_of(
+    session: Session, heliostat: HeliostatRow, surface: SurfaceRow | store.NewSurface | None
+) -> Period:
+    """The epoch of a surface version or new surface, which ends where the next one begins."""
+    since = None if surface is None else surface.epoch_since
+    return Period(since, store.next_epoch(session, heliostat, since))
