@@ -113,10 +113,9 @@ def _lost(
         return None
     change = changes[-1]
     drops = (change.before - change.after, change.min_drop, change.max_drop)
-    shares = (-math.expm1(-drop) for drop in drops)
-    return LostLight(
-        heliostat, target, change.since, change.until, *shares, len(dated) - change.first
-    )
+    share, least, most = (-math.expm1(-drop) for drop in drops)
+    count = len(dated) - change.first
+    return LostLight(heliostat, target, change.since, change.until, share, least, most, count)
 
 
 def _lost_at_most(values: Array, count: int) -> float:

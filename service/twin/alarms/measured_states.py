@@ -20,8 +20,6 @@ from service.twin.studies.camera_watch import CameraWatch
 
 # Lost share of the light above which a mirror counts as dimmed. Less is not distinct from haze.
 _MIN_LOSS = 0.05
-# Photographs since the calibration by which a pointing error is known.
-_MIN_PHOTOGRAPHS = 2
 # Median of a Rayleigh distribution, in standard deviations per axis.
 _MEDIAN = math.sqrt(2 * math.log(2))
 
@@ -57,12 +55,11 @@ def predicted_pointing_error(state: PointingState | None) -> Estimate | None:
     """Standard deviation per axis [mrad] of a heliostat's beam by photographs.
 
     None if its mount was not calibrated, or too few photographs say how well it predicts spots.
-    Residuals of the calibration's own photographs do not. Angles of two axes have a Rayleigh
-    distribution.
+    Angles of two axes have a Rayleigh distribution.
     """
-    if state is None or state.error_mrad is None or state.since_calibration < _MIN_PHOTOGRAPHS:
+    if state is None or state.error_mrad is None:
         return None
-    sigma, freedom = state.error_mrad / _MEDIAN, 2 * min(state.photographs, state.since_calibration)
+    sigma, freedom = state.error_mrad / _MEDIAN, 2 * state.photographs
     ends = (sigma * math.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.975, 0.025))
     value, low, high = (min(one, MRAD_RANGE[1]) for one in (sigma, *ends))
     return Estimate(value, (low, high))

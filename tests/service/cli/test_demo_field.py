@@ -224,15 +224,6 @@ def test_a_study_of_the_hazy_days_finds_wider_light(client: TestClient):
     assert found["name"] in ("sun_shape", "slope_error", "camera_blur")
 
 
-@pytest.fixture
-def changing(client: TestClient, tmp_path: Path) -> Iterator[TestClient]:
-    """A client on a copy of the store, which may change it."""
-    data = runtime_of(client).settings.data_dir
-    shutil.copytree(data, tmp_path / "data")
-    with client_on(tmp_path) as copy:
-        yield copy
-
-
 @pytest.mark.full
 def test_the_study_of_the_hazy_days_is_adopted_with_its_end_only(changing: TestClient):
     """It saw no photograph after the haze; those that came later ask for its end."""
