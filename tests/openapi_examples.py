@@ -91,7 +91,7 @@ class Recorder:
         answer = self.client.request(method, path, **options)
         assert answer.status_code == status, (name, answer.status_code, answer.text)
         media_type = answer.headers.get("content-type", "").partition(";")[0]
-        is_json = media_type == "application/json"
+        is_json = bool(answer.content) and media_type == "application/json"
         content = answer.json() if is_json else answer.text if media_type[:5] == "text/" else None
         if media_type == "text/plain":  # without what every process reports
             lines = content.splitlines()

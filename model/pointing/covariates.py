@@ -60,7 +60,7 @@ def explain_errors(
     """Judge each covariate on a field that was calibrated by ``readings``, padded from ``own``."""
     errors = np.full(readings.steps.shape, np.nan)
     for batch in calibrated_batches(kinds, readings):
-        errors[batch.rows, : batch.readings.used.shape[1]] = batch.model.leave_one_out_residuals()
+        errors[batch.rows, : batch.readings.used.shape[1]] = batch.model.left_out_errors().residuals
     found: list[Array] = []
     taken: list[Reading] = []
     for error, series in zip(errors, own, strict=True):

@@ -348,11 +348,11 @@ class ChangePointScore(NamedTuple):
 
 
 class LeftOutErrors(NamedTuple):
-    """Errors (H, M) [rad] of predictions by other measurements, and their standard deviations per
-    direction; NaN for foreign measurements and padding.
+    """Residuals (H, M, 2) [rad] to predictions by other measurements, and their standard deviations
+    (H, M) per direction; NaN for foreign measurements and padding.
     """
 
-    errors: Array
+    residuals: Array
     std: Array
 
 
@@ -382,22 +382,7 @@ class ConditionedModel:
             changes,
         )
 
-    def leave_one_out_residuals(self) -> Array:
-        """Return the residual (H, M, 2) [rad] of each measurement to its prediction by all others.
-
-        NaN for foreign measurements and padding. Source: Rasmussen and Williams 2006, eq. 5.12.
-        """
-        heliostats, most = self.model.readings.used.shape
-        solution = self.changes.solve(self.model)
-        blocks = solution.precision(self.model).reshape(heliostats, most, 2, most, 2)
-        diagonal = np.einsum("hiaib->hiab", blocks)
-        residuals = np.linalg.solve(diagonal, solution.precision_y.reshape(heliostats, most, 2, 1))[
-            ..., 0
-        ]
-        is_known = self.model.readings.used & ~self.changes.mask(*_FOREIGN)
-        return np.where(is_known[..., None], residuals, np.nan)
-
-    def left_out_errors(self, whole_days: bool) -> "LeftOutErrors":
+    def left_out_errors(self, whole_days: bool = False) -> "LeftOutErrors":
         """Predict each measurement by all others, or by those of all other days.
 
         Measurements of a day share the jitter of the drives, so they say little about another day.
@@ -413,9 +398,9 @@ class ConditionedModel:
         residuals = (covariance @ solution.precision_y[..., None]).reshape(heliostats, most, 2)
         variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(heliostats, most, 2)
         is_known = readings.used & ~self.changes.mask(*_FOREIGN)
+        std = np.sqrt(variance.mean(axis=-1))
         return LeftOutErrors(
-            np.where(is_known, np.linalg.norm(residuals, axis=-1), np.nan),
-            np.where(is_known, np.sqrt(variance.mean(axis=-1)), np.nan),
+            np.where(is_known[..., None], residuals, np.nan), np.where(is_known, std, np.nan)
         )
 
     def change_point_score(self, by_change: Array) -> ChangePointScore:

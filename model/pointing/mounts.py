@@ -188,11 +188,6 @@ class CalibratedMount:
         """Mark the parameters (P,) that the data determine."""
         return np.asarray(self.spread < DETERMINED * self.prior_spread)
 
-    @property
-    def errors_rad(self) -> Array:
-        """Angles (M,) [rad] between forecast and measured spots."""
-        return np.asarray(np.linalg.norm(self.residuals, axis=-1))
-
     def zeros_at(self, days: ArrayLike) -> Array:
         """Return the additions to the zeros (N, 2) [rad] at ``days`` (N,); NaN means the newest.
 
@@ -271,7 +266,8 @@ class CalibratedMount:
         """
         if self.foreign.all():
             return self.noise.spot_rad
-        return float(np.median(self.errors_rad[~self.foreign]) / np.sqrt(2 * np.log(2)))
+        angles = np.linalg.norm(self.residuals[~self.foreign], axis=-1)
+        return float(np.median(angles) / np.sqrt(2 * np.log(2)))
 
 
 def cause_of(step: Step, mount: CalibratedMount) -> Cause:

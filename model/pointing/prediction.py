@@ -8,11 +8,11 @@ Notes
 -----
 With the error e_i of measurement i, and s_i its standard deviation by the model, the ratios e_i /
 s_i of all heliostats have one distribution. It has heavier tails than the model's. The error of a
-heliostat has the distribution of products of its own s_i with all ratios. The interval is from the
-5 % quantile of predictions by all others to the 95 % quantile of those by other days. The latter is
-1 + 2 / n times larger for n measurements, because the field's prior and the changes over time are
-of all measurements. On real heliostats it holds 86 to 90 % of a random third of spots that the
-calibration has not seen.
+heliostat has the distribution of products of the heliostat's s_i with all ratios. The interval is
+from the 5 % quantile of predictions by all others to the 95 % quantile of those by other days. The
+latter is 1 + 2 / n times larger for n measurements, because the field's prior and the changes over
+time are of all measurements. On real heliostats it holds 86 to 90 % of a random third of spots that
+the calibration has not seen.
 """
 
 from collections.abc import Sequence
@@ -75,8 +75,8 @@ def _left_out_errors(kinds: Sequence[Kind], readings: Readings, whole_days: bool
     for batch in calibrated_batches(kinds, readings):
         found = batch.model.left_out_errors(whole_days)
         is_predicted = found.std < _UNKNOWN
-        width = found.errors.shape[1]
-        errors[batch.rows, :width] = np.where(is_predicted, found.errors, np.nan)
+        size, width = np.linalg.norm(found.residuals, axis=-1), found.std.shape[1]
+        errors[batch.rows, :width] = np.where(is_predicted, size, np.nan)
         std[batch.rows, :width] = np.where(is_predicted, found.std, np.nan)
     ratios = (errors / std)[np.isfinite(std)]
     expected = np.sqrt(-2 * np.log(1 - (np.arange(_N_EXPECTED) + 0.5) / _N_EXPECTED))

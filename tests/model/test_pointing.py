@@ -201,7 +201,7 @@ def test_the_predicted_error_is_that_of_spots_of_other_days(world, count: int):
         inside += ((errors >= found.low) & (errors <= found.high)).tolist()
         unseen.append(np.median(errors))
         predicted.append(found.median)
-        fitted.append(np.median(mount.errors_rad))
+        fitted.append(np.median(np.linalg.norm(mount.residuals, axis=-1)))
     assert 0.85 < np.mean(inside) < 0.97
     assert np.mean(predicted) == pytest.approx(np.mean(unseen), rel=0.3)
     assert np.mean(fitted) < (0.8 if count < 30 else 0.95) * np.mean(unseen)

@@ -586,7 +586,7 @@ def _ended_effects(contradicted: Sequence[ContradictedEffect]) -> Iterator[Alarm
             datetime.combine(one.until, clock(), UTC),
             one.in_words,
             f"{action}, see /studies/{one.study}/change",
-            f"{one.study} {one.key}",
+            f"{one.study} {one.effect}",
         )
 
 

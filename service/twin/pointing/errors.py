@@ -15,7 +15,6 @@ from sqlalchemy.orm import Session, undefer
 
 from model.errors import ModelError
 from model.pointing import Reading, pointing_error
-from model.pointing.mounts import PredictedError
 from model.pointing.prediction import MIN_MEASUREMENTS
 from model.pointing.report import moment_of
 from model.pointing.spots import spot_covariance
@@ -148,6 +147,10 @@ def pointing_state(
     days, off = days[days >= begin], off[days >= begin]
     is_enough = off.size >= MIN_MEASUREMENTS and (newer or mount.prediction is not None)
     error = float(np.median(off[-NEWEST:])) if is_enough else None
+    interval, predicted = None, mount.prediction
+    if predicted is not None and error is not None:  # in proportion to the newest errors
+        scale = error / predicted.median
+        interval = (scale * predicted.low, scale * predicted.high)
     return PointingState(
         mount_version=kept.version,
         calibrated_at=kept.created_at,
@@ -158,15 +161,8 @@ def pointing_state(
         beyond_since=None if error is None else _beyond_since(days, off, limit_mrad),
         moved=moved,
         drifted=_drifted(kept),
-        interval_mrad=_interval(mount.prediction, error),
+        interval_mrad=interval,
     )
-
-
-def _interval(predicted: PredictedError | None, error: float | None) -> tuple[float, float] | None:
-    """The interval of the calibration's prediction, in proportion to the newest ``error``."""
-    if predicted is None or error is None:
-        return None
-    return error * predicted.low / predicted.median, error * predicted.high / predicted.median
 
 
 def _forecast_errors(

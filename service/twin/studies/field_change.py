@@ -7,11 +7,12 @@ cleaned. So some photographs of each day are forecast with and without an effect
 import json
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import date, datetime
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import BaseModel, Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -127,37 +128,36 @@ def _gains_of_heliostat(
     return dict(zip([one.id for one in photographs], (new - old).tolist(), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class ContradictedEffect:
-    """An effect of a study that later photographs contradict.
+class AccuracyGain(BaseModel):
+    """Mean change of accuracy [1] with its 95 % interval, on some photographs."""
 
-    Attributes
-    ----------
-    key : str
-        See `service.twin.plant.model_versions.effect_key`.
-    study : int
-    until : date
-        First day without it.
-    gain : Gain
-        Of accuracy [1] by it since then.
-    photographs : int
-    can_end : bool
-        Whether it acted before that day. If not, it never made photographs better.
-    """
+    mean: float = Field(description="Mean change of accuracy [1].")
+    ci95: tuple[float, float] = Field(description="Its 95 % interval [1].")
+    photographs: int = Field(description="Number of photographs.")
 
-    key: str
-    study: int
-    until: date
-    gain: Gain
-    photographs: int
-    can_end: bool
+    @classmethod
+    def of(cls, gain: Gain, photographs: int) -> "AccuracyGain":
+        """The gain on a number of photographs."""
+        return cls(mean=gain.mean, ci95=(gain.low, gain.high), photographs=photographs)
+
+
+class ContradictedEffect(BaseModel):
+    """An effect that makes photographs after its study worse."""
+
+    effect: str = Field(description="Its name, as `until` of the adoption takes it.")
+    study: int = Field(description="The study that found it.")
+    until: date = Field(description="First day on which photographs are worse with it.")
+    can_end: bool = Field(
+        description="Whether it acted before that day, and can be adopted until then."
+    )
+    gain: AccuracyGain = Field(description="Change of accuracy by it since that day.")
 
     @property
     def in_words(self) -> str:
         """The contradiction as a clause."""
         return (
-            f"{self.key.replace('_', ' ')} makes {self.photographs} photographs since {self.until}"
-            f" worse, by {-100 * self.gain.mean:.1f} points of accuracy in the mean"
+            f"{self.effect.replace('_', ' ')} makes {self.gain.photographs} photographs since"
+            f" {self.until} worse, by {-100 * self.gain.mean:.1f} points of accuracy in the mean"
         )
 
 
@@ -193,51 +193,41 @@ def find_contradiction(
     if end is None:
         return None
     return ContradictedEffect(
-        effect_key(effect),
-        study.id,
-        end.day,
-        end.gain,
-        sum(day >= end.day for day in days),
-        end.day > model_versions.first_day(effect, study),
+        effect=effect_key(effect),
+        study=study.id,
+        until=end.day,
+        can_end=end.day > model_versions.first_day(effect, study),
+        gain=AccuracyGain.of(end.gain, sum(day >= end.day for day in days)),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class FieldChange:
-    """Gain of a study's effects on photographs of the field, and on those after the study.
+class FieldChange(BaseModel):
+    """What the effects of a study change in forecasts of stored photographs.
 
-    Attributes
-    ----------
-    whole, later : Gain
-        Mean changes of accuracy [1], zero included where nothing changes.
-    n_whole, n_later : int
-        Numbers of photographs.
-    contradicted : tuple of ContradictedEffect
+    A candidate is compared with the current model. An adopted one is what the current model would
+    be without its effects. Photographs are some of each day, of heliostats with a surface.
     """
 
-    whole: Gain
-    later: Gain
-    n_whole: int
-    n_later: int
-    contradicted: tuple[ContradictedEffect, ...]
-
-    @property
-    def is_harmful(self) -> bool:
-        """Whether photographs after the study are significantly worse."""
-        return is_worse(self.later) or bool(self.contradicted)
+    whole: AccuracyGain = Field(description="On photographs of the whole field.")
+    later: AccuracyGain = Field(
+        description="On those that came after the last one of the study; zero below two."
+    )
+    is_harmful: bool = Field(description="Whether later ones are significantly worse.")
+    contradicted: list[ContradictedEffect] = Field(
+        description="Effects that later photographs contradict."
+    )
 
     @property
     def ends(self) -> dict[str, date]:
         """The days with which contradicted effects can be adopted."""
-        return {one.key: one.until for one in self.contradicted if one.can_end}
+        return {one.effect: one.until for one in self.contradicted if one.can_end}
 
     @property
     def in_words(self) -> str:
         """What photographs after the study say, as a clause."""
-        change = f"by {100 * self.later.mean:+.1f} points on {self.n_later} photographs after it"
-        return "; ".join(
-            [f"accuracy changes {change}", *(one.in_words for one in self.contradicted)]
-        )
+        points = f"{100 * self.later.mean:+.1f} points"
+        said = f"accuracy changes by {points} on {self.later.photographs} photographs after it"
+        return "; ".join([said, *(one.in_words for one in self.contradicted)])
 
 
 def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -> FieldChange:
@@ -277,12 +267,12 @@ def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -
         for effect, photographs in zip(found, acting, strict=True)
         if model_versions.is_open(effect)
     ]
+    known, change = [one for one in contradicted if one is not None], few_gain(np.array(later))
     return FieldChange(
-        few_gain(np.array(list(gains.values()))),
-        few_gain(np.array(later)),
-        len(gains),
-        len(later),
-        tuple(one for one in contradicted if one is not None),
+        whole=AccuracyGain.of(few_gain(np.array(list(gains.values()))), len(gains)),
+        later=AccuracyGain.of(change, len(later)),
+        is_harmful=is_worse(change) or bool(known),
+        contradicted=known,
     )
 
 

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     Field,
     InstanceOf,
     StringConstraints,
@@ -20,7 +21,6 @@ from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE
 from model.errors import InvalidInputError
-from model.study.judging import Gain
 from model.study.loop import MIN_IMAGES
 from service import store
 from service.base.errors import ConflictError, NotFoundError
@@ -149,40 +149,6 @@ class AdoptedOut(ModelOut):
     )
 
 
-class GainOut(BaseModel):
-    """A mean change of accuracy."""
-
-    mean: float = Field(description="Mean change of accuracy [1].")
-    ci95: tuple[float, float] = Field(description="Its 95 % interval [1].")
-
-
-class ContradictedEffectOut(BaseModel):
-    """An effect that makes photographs after its study worse."""
-
-    effect: str = Field(description="Its name, as `until` of the adoption takes it.")
-    until: date = Field(description="First day on which photographs are worse with it.")
-    can_end: bool = Field(description="Whether it can be adopted until that day.")
-    gain: GainOut = Field(description="Change of accuracy by it since that day.")
-    photographs: int = Field(description="Number of photographs since that day.")
-
-
-class FieldChangeOut(BaseModel):
-    """What the effects of a study change in forecasts of stored photographs.
-
-    A candidate is compared with the current model. An adopted one is what the current model would
-    be without its effects. Photographs are some of each day, of heliostats with a surface.
-    """
-
-    whole: GainOut = Field(description="On photographs of the whole field.")
-    n_whole: int = Field(description="Number of them.")
-    later: GainOut = Field(description="On those that came after the last one of the study.")
-    n_later: int = Field(description="Number of them.")
-    is_harmful: bool = Field(description="Whether later ones are significantly worse.")
-    contradicted: list[ContradictedEffectOut] = Field(
-        description="Effects that later photographs contradict."
-    )
-
-
 EffectEnds = dict[Text, date]
 
 
@@ -220,6 +186,12 @@ class WithdrawIn(Model):
     reason: Reason | None = Field(default=None, description="Why; kept with the version.")
 
 
+def _ends_of_form(given: object) -> object:
+    """Effects with the days of their ends, from `name day` each."""
+    values = [given] if isinstance(given, str) else given
+    return dict(one.rpartition(" ")[::2] for one in values) if isinstance(values, list) else values
+
+
 class DecisionForm(WithdrawIn):
     """The body of a decision as a form.
 
@@ -229,20 +201,10 @@ class DecisionForm(WithdrawIn):
 
     read: bool = False
     back: Literal["", "list"] = ""
-    ended: list[Text] = Field(default=[], max_length=100)
+    ended: Annotated[EffectEnds, BeforeValidator(_ends_of_form)] = Field(default={}, max_length=100)
     current: ReadVersion = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
-
-    @property
-    def asked(self) -> AdoptIn:
-        """The body of REST."""
-        until = dict(one.rsplit(" ", 1) for one in self.ended if " " in one)
-        about = {"force": self.read, "reason": self.reason, "until": until}
-        try:
-            return AdoptIn.model_validate(about)
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
 
     def return_from(self, number: int) -> Response:
         """Go back to the page."""
@@ -469,26 +431,13 @@ def get_change_page(
 @router.get(
     "/studies/{number}/change", responses=problems(404, 409), dependencies=[READ, COMPUTE_SLOT]
 )
-def get_study_change(number: Number, runtime: RuntimeDep) -> FieldChangeOut:
+def get_study_change(number: Number, runtime: RuntimeDep) -> FieldChange:
     """Get what adoption changes in forecasts of stored photographs.
 
     They are of the whole field, and of the time after the study. They are forecast for this
     response. Adopting does the same, and answers 409 if `is_harmful`.
     """
-    return _change_out(read_field_change(runtime, number))
-
-
-def _change_out(change: FieldChange) -> FieldChangeOut:
-    contradicted = [
-        from_row(ContradictedEffectOut, one, effect=one.key, gain=_gain_out(one.gain))
-        for one in change.contradicted
-    ]
-    gains = {"whole": _gain_out(change.whole), "later": _gain_out(change.later)}
-    return from_row(FieldChangeOut, change, contradicted=contradicted, **gains)
-
-
-def _gain_out(gain: Gain) -> GainOut:
-    return GainOut(mean=gain.mean, ci95=(gain.low, gain.high))
+    return read_field_change(runtime, number)
 
 
 @router.get(
@@ -561,8 +510,9 @@ def post_adopt_form(
     """Adopt the result of a study as the next plant model."""
     if form.reason and not form.read and get_study(number, runtime).open_questions:
         raise ConflictError("read: tick 'I have read this' below the warning")
+    asked = AdoptIn(force=form.read, reason=form.reason, until=form.ended)
     try:
-        _adopt(runtime, number, identity.name, form.asked, form.current)
+        _adopt(runtime, number, identity.name, asked, form.current)
     except ContradictionError:  # its page shows the change, and offers what to do
         return go_to(f"/studies/{number}/change#adopt-title")
     return form.return_from(number)

@@ -86,11 +86,12 @@ def test_later_photographs_refuse_an_effect_without_its_end(
 ):
     study = keep(app, SLOPE | {"scope": scope})
     change = hazy.get(f"{study}/change").json()
-    assert (change["n_whole"], change["n_later"], change["is_harmful"]) == (12, 7, True)
+    counts = [change[part]["photographs"] for part in ("whole", "later")]
+    assert (*counts, change["is_harmful"]) == (12, 7, True)
     assert change["later"]["mean"] == pytest.approx((0.1 - 6 * 0.1) / 7, abs=0.001)
     (found,) = change["contradicted"]
     assert (found["effect"], found["until"]) == ("slope_error", "2026-06-07")
-    assert (found["can_end"], found["photographs"]) == (True, 6)
+    assert (found["can_end"], found["gain"]["photographs"]) == (True, 6)
     for body in ({}, {"force": True}, {"reason": "it is so"}):
         refused = hazy.post(f"{study}/adopt", json=body)
         assert refused.status_code == 409
