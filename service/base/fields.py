@@ -494,7 +494,7 @@ class MountReport(BaseModel):
     measurements: int = Field(description="How many measurements the calibration used.")
     predicted_error_mrad: PredictedErrorOut = Field(
         default=PredictedErrorOut(median=None, ci90=None, measurements=0),
-        description="Pointing error that a next photograph will show.",
+        description="Pointing error that a next photograph will show [mrad].",
     )
     parameters: dict[str, dict[str, Any]] = Field(
         description=(
