@@ -14,10 +14,9 @@ from model.metrics import flux_accuracy
 from model.study.judging import Gain, few_gain
 from service import store
 from service.base.choices import Method
-from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import NewSurface
-from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
+from service.store.tables import MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     Array,
     HeliostatContext,
@@ -116,19 +115,10 @@ def evaluate_first_surface(runtime: Runtime, twin: HeliostatContext, new: NewSur
     return _evaluation(None, decision, judged)
 
 
-def decide_by_hand(
-    runtime: Runtime,
-    name: str,
-    version: int,
-    became_active: bool,
-    actor: str,
-    reason: str,
-    shown: int | None = None,
-) -> DecisionRow:
-    """Record a person's decision on a version, with what photographs of its epoch say.
+def justify_by_hand(runtime: Runtime, name: str, version: int, reason: str) -> Justification:
+    """A person's reason, with what photographs of the version's epoch say of it.
 
-    The photographs are those that neither it nor the active surface was computed from. Arguments
-    and errors are those of `service.store.surfaces.decisions.decide`.
+    They are photographs that neither it nor the active surface was computed from.
     """
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, name)
@@ -136,18 +126,13 @@ def decide_by_hand(
         chosen = store.get_surface(session, twin.row, version)
         seen = photographs_of_surface(active) | photographs_of_surface(chosen)
         rows, unseen = held_out_first(session, twin.row, seen, epoch_of(session, twin.row, chosen))
-    grounds = Justification(reason)
-    if unseen:
-        before, after = (
-            float(_accuracies(runtime, twin, rows[:unseen], heights_of(one)).mean())
-            for one in (active, chosen)
-        )
-        grounds = Justification(reason, before, after, unseen)
-    return runtime.database.run_in_transaction(
-        lambda session: decisions.decide(
-            session, name, version, became_active, actor, grounds, shown
-        )
+    if not unseen:
+        return Justification(reason)
+    before, after = (
+        float(_accuracies(runtime, twin, rows[:unseen], heights_of(one)).mean())
+        for one in (active, chosen)
     )
+    return Justification(reason, before, after, unseen)
 
 
 # --- photographs that judge

@@ -39,7 +39,7 @@ from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.evaluation import decide_by_hand
+from service.twin.surfaces.evaluation import justify_by_hand
 from service.twin.surfaces.prediction import predict_surface
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -381,8 +381,11 @@ def put_current_surface(
     Both are compared on photographs that neither has seen. Versions with precedence over it become
     candidates.
     """
-    return decision_out(
-        decide_by_hand(runtime, name, choice.version, True, identity.name, choice.reason, active)
+    grounds = justify_by_hand(runtime, name, choice.version, choice.reason)
+    return runtime.database.run_in_transaction(
+        lambda session: decision_out(
+            decisions.decide(session, name, choice.version, True, identity.name, grounds, active)
+        )
     )
 
 

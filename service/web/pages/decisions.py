@@ -15,7 +15,8 @@ from service.twin.photographs.corrections import (
     PhotographChanges,
     correct_photographs,
 )
-from service.twin.surfaces.evaluation import decide_by_hand
+from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.evaluation import justify_by_hand
 from service.web.api.corrections import predict_again
 from service.web.api.surfaces import SurfaceAcknowledgementIn
 from service.web.auth.dependencies import (
@@ -38,6 +39,18 @@ class TakeForm(Model):
     active: ReadVersion = None
 
 
+def _decide(
+    runtime: Runtime, name: str, version: int, became_active: bool, actor: str, form: TakeForm
+) -> None:
+    done = "chose it" if became_active else "kept the active surface"
+    grounds = justify_by_hand(runtime, name, version, form.reason or f"{actor} {done}")
+    runtime.database.run_in_transaction(
+        lambda session: decisions.decide(
+            session, name, version, became_active, actor, grounds, form.active
+        )
+    )
+
+
 @router.post("/heliostats/{name}/surfaces/{version}/take", dependencies=[OPERATE])
 def post_take_form(
     name: NamePath,
@@ -47,8 +60,7 @@ def post_take_form(
     identity: IdentityDep,
 ) -> Response:
     """Make a version the active surface."""
-    reason = form.reason or f"{identity.name} chose it"
-    decide_by_hand(runtime, name, version, True, identity.name, reason, form.active)
+    _decide(runtime, name, version, True, identity.name, form)
     return go_to(f"/heliostats/{name}#history-title")
 
 
@@ -61,8 +73,7 @@ def post_keep_form(
     identity: IdentityDep,
 ) -> Response:
     """Keep the active surface instead of a candidate."""
-    reason = form.reason or f"{identity.name} kept the active surface"
-    decide_by_hand(runtime, name, version, False, identity.name, reason, form.active)
+    _decide(runtime, name, version, False, identity.name, form)
     return go_to(f"/heliostats/{name}#history-title")
 
 
