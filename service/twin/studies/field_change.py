@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from model.effects import ByDay, Effect
+from model.effects import Always, ByDay, Effect
 from model.errors import ModelError
 from model.metrics import flux_accuracies
 from model.study.judging import Gain, few_gain, find_end, is_worse
@@ -252,6 +252,13 @@ def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -
         if not found:
             raise ConflictError(f"study {number} found no effect; adopting it changes nothing")
         if not ends and model_versions.find_adopted(session, number) is not None:
+            # They may have got an end since.
+            plain = {effect_text(replace(effect, scope=Always())) for effect in found}
+            found = tuple(
+                effect
+                for effect in before.effects
+                if effect_text(replace(effect, scope=Always())) in plain
+            )
             before, after = without(before, found), before
         sample = sample_photographs(session)
         acting = [photographs_of_effect(session, effect, study) for effect in found]

@@ -123,6 +123,8 @@ def test_adopted_effect_that_ended_raises_an_alarm_until_it_gets_its_end(
     assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
     assert alarms(hazy) == []
     assert "End slope error" not in change_page(hazy)
+    gain = hazy.get("/v1/studies/1/change").json()["whole"]["mean"]
+    assert gain == pytest.approx(6 * 0.1 / 12, abs=0.001)
 
 
 def test_page_of_the_change_offers_the_end_first(app: FastAPI, hazy: TestClient):
