@@ -342,8 +342,10 @@ def administrate(record: Recorder, key: str) -> None:
     record.call("list_alarm_causes", "GET /v1/alarms/causes")
     record.call("list_alarm_history", "GET /v1/alarms/history")
     record.call("undo_acknowledgements", f"POST {path}/{batches[0]['id']}/undo")
-    record.call("delete_target", "DELETE /v1/targets/upper-target", 204)
-    record.call("delete_receiver", "DELETE /v1/receivers/upper-receiver", 204)
+    record.call("delete_target", "DELETE /v1/targets/upper-target?reason=posted+by+mistake", 204)
+    record.call(
+        "delete_receiver", "DELETE /v1/receivers/upper-receiver?reason=posted+by+mistake", 204
+    )
     record.call("list_audit", "GET /v1/audit")
     record.call("post_session", "POST /session", 204, data={"key": key})
     record.examples["post_session"]["body"] = {"key": KEY}
