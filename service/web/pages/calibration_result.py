@@ -29,12 +29,12 @@ OFFSETS = {
 class CalibrationView:
     """The result of a calibration.
 
-    ``mounts`` has documents by heliostat, None if a later calibration replaced it. ``outliers`` are
+    ``mounts`` has documents by heliostat. ``outliers`` are
     (heliostat, photograph, detail), and ``skipped`` (heliostat, photograph or "") by reason.
     """
 
     versions: Mapping[str, int]
-    mounts: Mapping[str, Mapping[str, Any] | None]
+    mounts: Mapping[str, Mapping[str, Any]]
     steps: list[tuple[str, Mapping[str, object]]]
     outliers: list[tuple[str, str, str]]
     skipped: Mapping[str, list[tuple[str, str]]]
@@ -60,12 +60,7 @@ def calibration_view(
         .join(MountRow, MountRow.heliostat_id == HeliostatRow.id)
         .where(HeliostatRow.name.in_(names))
     )
-    documents = {
-        name: mount.document
-        for name, mount in rows
-        if mount.version == versions[name]
-        and (job.finished_at is None or mount.created_at <= job.finished_at)
-    }
+    documents = {name: mount.document for name, mount in rows if mount.version == versions[name]}
     skipped = dict[str, list[tuple[str, str]]]()
     for key, reason in sorted(result.get("skipped", {}).items()):
         name, _, photograph = key.partition("/")
@@ -73,7 +68,7 @@ def calibration_view(
     undated = result.get("undated")
     return CalibrationView(
         versions,
-        {name: documents.get(name) for name in names},
+        {name: documents[name] for name in names if name in documents},
         [
             (name, _step(step))
             for name, steps in sorted(result.get("steps", {}).items())

@@ -57,6 +57,7 @@ WITHOUT_UNIT = {
     "accuracy_median",
     "attenuation",
     "blocking",
+    "cleanliness",
     "cosine",
     "explained_share",
     "gear",
@@ -73,6 +74,10 @@ WITHOUT_UNIT = {
     "shading",
     "score",
     "unexplained_share",
+    # Intervals of the value beside them, whose unit its name or the field above has.
+    "ci90",
+    "ci95",
+    "median",
     # Values of an effect's parameter, whose unit is the field beside it (DESIGN.md, section 7).
     "by_day",
     # Of cameras: matrices, and coefficients of a lens.
@@ -169,12 +174,15 @@ def test_versions_are_integers(document: dict[str, Any]):
     assert others == []
 
 
+DAYS = ("EffectScope.since", "EffectScope.until", "AdoptIn.until", "ContradictedEffect.until")
+COUNTED = ("MountOut.measurements", "PredictedErrorOut.measurements")
+
+
 def test_times_have_the_name_of_a_time(document: dict[str, Any]):
     wrong = [
         place
         for place, name, schema in fields(document)
-        if ("date-time" in kinds(schema)) != bool(TIME.match(name))
-        and place not in ("EffectScope.since",)
+        if ("date-time" in kinds(schema)) != bool(TIME.match(name)) and place not in DAYS
     ]
     assert wrong == []
 
@@ -184,7 +192,7 @@ def test_measurements_are_ids_and_photographs_are_counted(document: dict[str, An
     others = [
         place
         for place, name, schema in fields(document)
-        if name in wanted and kinds(schema) != wanted[name] and place != "MountOut.measurements"
+        if name in wanted and kinds(schema) != wanted[name] and place not in COUNTED
     ]
     assert others == []
 
