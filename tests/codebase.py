@@ -207,7 +207,7 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 51_200,
+    "lines of code": 51_210,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,

@@ -161,6 +161,16 @@ class HeliostatFacts:
 
 
 @dataclass(frozen=True)
+class Offer:
+    """A request that does what a cause asks for."""
+
+    label: Annotated[str, Field(description="What it does.")]
+    method: Annotated[Literal["POST", "PATCH"], Field(description="Method of the request.")]
+    path: Annotated[str, Field(description="Its path.")]
+    body: Annotated[dict[str, object], Field(description="Its body as JSON.")]
+
+
+@dataclass(frozen=True)
 class LikelyCause:
     """A likely cause of poor forecasts, with its evidence."""
 
@@ -181,6 +191,9 @@ class LikelyCause:
     since: Annotated[datetime | None, Field(description="When the mirror changed.")] = None
     study: Annotated[
         int | None, Field(description="The study that found what the model lacks.")
+    ] = None
+    offer: Annotated[
+        Offer | None, Field(description="What to do about it; null: nothing that a request does.")
     ] = None
 
     __pydantic_config__ = ConfigDict(json_schema_serialization_defaults_required=True)
@@ -257,7 +270,34 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
         if kinds and not any(one.kind in kinds for one in found):
             found.append(LikelyCause(kinds[0], _OF_OPEN_ALARM, said))
     order = list(CAUSES)
-    return sorted(found, key=lambda one: (-one.explained_share, order.index(one.kind)))
+    found.sort(key=lambda one: (-one.explained_share, order.index(one.kind)))
+    return [replace(one, offer=_offer(facts, one)) for one in found]
+
+
+def _offer(facts: HeliostatFacts, cause: LikelyCause) -> Offer | None:
+    """What a person would do about a cause, where a request does it."""
+    name = facts.line.name
+    of_name: dict[str, object] = {"heliostats": [name]}
+    refined = of_name | {"method": "refined"}
+    match cause.kind:
+        case "no_surface" if facts.line.candidate is None:
+            return Offer("Predict its surface", "POST", "/v1/jobs/predictions", refined)
+        case "mirror" if cause.since is not None:
+            since = {"since": cause.since.isoformat()}
+            label = "Predict again from photographs since then"
+            return Offer(label, "POST", "/v1/jobs/predictions", refined | since)
+        case "foreign_light" if cause.measurements:
+            path = f"/v1/heliostats/{name}/measurements/{cause.measurements[0]}"
+            body: dict[str, object] = {"excluded": True, "reason": cause.evidence[:200]}
+            return Offer(f"Exclude photograph {cause.measurements[0]}", "PATCH", path, body)
+        case "moved":
+            return Offer("Calibrate its mount again", "POST", "/v1/jobs/calibrations", of_name)
+        case "model" if cause.study is not None:
+            path = f"/v1/studies/{cause.study}/adopt"
+            return Offer(f"Adopt study {cause.study}", "POST", path, {})
+        case "model":
+            return Offer("Study its photographs", "POST", "/v1/jobs/studies", of_name)
+    return None
 
 
 def _no_surface(facts: HeliostatFacts) -> list[LikelyCause]:

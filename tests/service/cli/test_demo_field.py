@@ -163,8 +163,11 @@ def test_from_its_alarm_to_the_right_surface_of_a_changed_mirror(changing: TestC
         return fmean(flux_accuracy(*pair) for pair in pairs)
 
     assert accuracy() < 0.85
-    made_of = {"heliostats": [name], "since": alarm["since"], "method": "refined"}
-    (judged,) = run_job(changing, "/v1/jobs/predictions", **made_of)["judged"].values()
+    causes = changing.get(f"/v1/heliostats/{name}/causes").json()["items"]
+    (offer,) = (one["offer"] for one in causes if one["kind"] == "mirror")
+    assert (offer["method"], offer["path"]) == ("POST", "/v1/jobs/predictions")
+    assert datetime.fromisoformat(offer["body"]["since"]) == since
+    (judged,) = run_job(changing, offer["path"], **offer["body"])["judged"].values()
     assert judged["became_active"], judged
     assert "in cross-validation" in judged["reason"]
     assert accuracy() > 0.92

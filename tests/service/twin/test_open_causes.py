@@ -15,6 +15,11 @@ def test_no_surface_is_the_first_cause_and_blames_no_photograph():
     first, *_ = rank_causes(facts)
     assert (first.kind, first.label) == ("no_surface", "No surface is active")
     assert outlier_reasons(facts) == {}
+    assert first.offer is not None
+    assert (first.offer.path, first.offer.body) == (
+        "/v1/jobs/predictions",
+        {"heliostats": ["R10-10"], "method": "refined"},
+    )
 
 
 @pytest.mark.parametrize(
