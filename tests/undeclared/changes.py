@@ -72,6 +72,7 @@ def since(name: str, of_one: bool = False) -> Change:
         scope = {
             "kind": "since",
             "since": begins.isoformat(),
+            "until": None,
             "heliostats": chosen if of_one else None,
         }
         return worlds, [_truth(name, own, scope)]
@@ -86,7 +87,7 @@ def law_since(level: int, plans: Sequence[Plan], rng: np.random.Generator) -> Ch
     """
     begins = _begin(plans, rng)
     changed = World(law=_law(level, rng))
-    scope = {"kind": "since", "since": begins.isoformat(), "heliostats": None}
+    scope = {"kind": "since", "since": begins.isoformat(), "until": None, "heliostats": None}
     return [changed if plan.day >= begins else World() for plan in plans], [
         _truth("camera_response", {}, scope)
     ]

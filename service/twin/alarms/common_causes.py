@@ -94,7 +94,7 @@ def find_common_causes(
 ) -> list[CommonCause]:
     """Find bursts among ``alarms`` that nobody acknowledged, the largest first."""
     opened = [alarm for alarm in alarms if alarm.acknowledged_by is None]
-    clocks = _same_clocks(session, opened)
+    clocks = _same_clocks(session, opened, settings)
     explained = {alarm.key for one in clocks for alarm in one.members}
     opened = [alarm for alarm in opened if alarm.key not in explained]
     found = clocks + [
@@ -115,7 +115,9 @@ def find_common_causes(
     return sorted(merged, key=lambda one: -len(one.members))
 
 
-def _same_clocks(session: Session, alarms: Sequence[Alarm]) -> list[CommonCause]:
+def _same_clocks(
+    session: Session, alarms: Sequence[Alarm], settings: Settings
+) -> list[CommonCause]:
     """Contradictions of sun and time that one wrong clock explains, of whatever days."""
     of = {a.heliostat: a for a in alarms if a.reason == SUN_CONTRADICTS_TIME and a.heliostat}
     row = MeasurementRow
@@ -125,11 +127,13 @@ def _same_clocks(session: Session, alarms: Sequence[Alarm]) -> list[CommonCause]
     for name, warnings in session.execute(query):
         for detail in _clock_details(warnings):
             clocks.setdefault(detail, {})[name] = of[name]
-    return [
-        CommonCause(tuple(by_name.values()), (detail,))
-        for detail, by_name in clocks.items()
-        if len(by_name) >= _MIN_SAME_CLOCK
-    ]
+    found = []
+    for detail, by_name in clocks.items():
+        if len(by_name) >= _MIN_SAME_CLOCK:
+            same = tuple(by_name.values())
+            others = (one for one in _evidence(session, same, alarms, settings) if one != detail)
+            found.append(CommonCause(same, (detail, *others)))
+    return found
 
 
 def _clock_details(warnings: Sequence[Mapping[str, str]] | None) -> list[str]:
