@@ -122,7 +122,7 @@ def make_case(
 
 
 def _faults(rng: np.random.Generator, names: Sequence[str], strength: int) -> Iterator[Fault]:
-    """One fault of each kind, each on heliostats of its own."""
+    """One fault of each kind, each on other heliostats."""
     free = iter(rng.permutation(names).tolist())
     for kind, sizes in SIZES.items():
         begin = float(UNSEEN + rng.integers(12, 24))
@@ -182,7 +182,7 @@ class _Bent:
 
 @contextmanager
 def service_on(store: Path) -> Iterator[tuple[TestClient, Runtime]]:
-    """A client of the service on a store, without workers of its own."""
+    """A client of the service on a store, without workers of their own."""
     settings = Settings(data_dir=store, database_url=None, host="127.0.0.1", job_workers=0)
     app = create_app(settings)
     with TestClient(app, base_url="http://127.0.0.1") as client:
