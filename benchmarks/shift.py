@@ -182,7 +182,7 @@ class _Bent:
 
 @contextmanager
 def service_on(store: Path) -> Iterator[tuple[TestClient, Runtime]]:
-    """A client of the service on a store, without workers of their own."""
+    """A client of the service on a store; jobs run only where `work` runs them."""
     settings = Settings(data_dir=store, database_url=None, host="127.0.0.1", job_workers=0)
     app = create_app(settings)
     with TestClient(app, base_url="http://127.0.0.1") as client:
