@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from statistics import fmean as mean
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -269,11 +269,19 @@ def offers(client: TestClient) -> list[tuple[str | None, dict[str, Any]]]:
     return list(found.items())
 
 
+class Action(NamedTuple):
+    """What was done, its gain [1] for its heliostat or the field, and the worst of both."""
+
+    label: str
+    gain: float
+    worst: float
+
+
 def run_shift(
     store: Path, unseen: Path, photographs: Sequence[PlannedPhotograph], most: int
-) -> tuple[list[tuple[str, float]], dict[str, float]]:
+) -> tuple[list[Action], dict[str, float]]:
     """Take offers until none is left; the change of accuracy [1] by each, and all at the end."""
-    done, changes = set[str](), list[tuple[str, float]]()
+    done, changes = set[str](), list[Action]()
     before = judge(store, unseen, photographs)
     for _ in range(most):
         with service_on(store) as (client, runtime):
@@ -289,9 +297,10 @@ def run_shift(
             work(runtime)
         some = [one for one in photographs if name is None or one.mirror.name == name]
         after = before | judge(store, unseen, some)
-        lost = min((after[one] - before.get(one, 0.0) for one in after), default=0.0)
+        gains = {one: after[one] - before.get(one, 0.0) for one in after}
         field = mean(after.values()) - mean(before.values())
-        changes.append((f"{name or 'plant'}: {offer['label']}", min(lost, field)))
+        label = f"{name or 'plant'}: {offer['label']}"
+        changes.append(Action(label, gains.get(name, field), min(field, *gains.values())))
         before = after
     return changes, before
 
@@ -308,7 +317,7 @@ def main() -> None:
     with recording("shift"):
         for word in options.strengths:
             strength = {"strong": 0, "weak": 1, "none": None}[word]
-            changes, gained = list[tuple[str, float]](), list[float]()
+            changes, gained = list[Action](), list[float]()
             gaps, untouched = list[float](), 0
             for seed in range(options.seeds):
                 with tempfile.TemporaryDirectory() as folder:
@@ -333,9 +342,9 @@ def main() -> None:
                     fill(root / "ideal", root / "oracle", ideal)
                     best = judge(root / "oracle", root / "unseen", later)
                     gaps.append(mean(best.values()) - mean(ended.values()))
-            bad = [one for one in changes if one[1] < -WORSE]
-            for action, change in changes:
-                print(f"{100 * change:+.2f} points  {action}")
+            bad = [one for one in changes if one.worst < -WORSE]
+            for one in changes:
+                print(f"{100 * one.gain:+.2f} points  {one.label}")
             cells = {
                 "actions": len(changes),
                 "of them made unseen photographs worse": len(bad),
