@@ -4,8 +4,9 @@ import ctypes
 import os
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
+
+from service.base.background import in_background
 
 # From glibc's `malloc.h`: the number of arenas that threads share.
 _M_ARENA_MAX = -8
@@ -39,19 +40,11 @@ def return_memory() -> None:
         trim(0)
 
 
-@contextmanager
-def returning_memory() -> Iterator[None]:
+def returning_memory() -> AbstractContextManager[None]:
     """Call `return_memory` from time to time while the block runs."""
-    ended = threading.Event()
 
-    def work() -> None:
+    def work(ended: threading.Event) -> None:
         while not ended.wait(_RETURN_EVERY_S):
             return_memory()
 
-    thread = threading.Thread(target=work, name="return-memory", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+    return in_background(work, "return-memory")

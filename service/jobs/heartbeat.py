@@ -3,11 +3,12 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.base.background import in_background
 from service.jobs.kind import Context
 from service.store.jobs import queue
 
@@ -17,23 +18,15 @@ logger = logging.getLogger("heliotwin.jobs")
 _BEATS_PER_LEASE = 3
 
 
-@contextmanager
-def heartbeat(context: Context, name: str, on_silence: Callable[[], None]) -> Iterator[None]:
+def heartbeat(
+    context: Context, name: str, on_silence: Callable[[], None]
+) -> AbstractContextManager[None]:
     """Renew the lease of a job in another thread until the block ends.
 
     ``name`` is the worker's. If the work shows no sign of life for ``job_silence_s``, the thread
     calls ``on_silence`` and ends.
     """
-    ended = threading.Event()
-    thread = threading.Thread(
-        target=_beat, args=(context, ended, on_silence), name=f"{name}-heart", daemon=True
-    )
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+    return in_background(lambda ended: _beat(context, ended, on_silence), f"{name}-heart")
 
 
 def _beat(context: Context, ended: threading.Event, on_silence: Callable[[], None]) -> None:
