@@ -30,6 +30,7 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant import model_versions
 
 MIN_OF_EPOCH = 5
@@ -183,10 +184,8 @@ def current_epoch(session: Session, heliostat: HeliostatRow, settings: Settings)
     """The newest epoch of a mirror, a candidate or confirmed; None if it never changed."""
     active = store.find_surface_at(session, heliostat)
     begun = None if active is None else active.epoch_since
-    candidates = [
-        _of_fall(session, heliostat, settings),
-        _of_study(session, heliostat, _zone(session, settings)),
-    ]
+    zone = ZoneInfo(plant_time_zone(session, settings.time_zone))
+    candidates = [_of_fall(session, heliostat, settings, zone), _of_study(session, heliostat, zone)]
     newest = max(
         (one for one in candidates if one is not None and (begun is None or one.since > begun)),
         key=lambda one: one.since,
@@ -207,15 +206,12 @@ def waiting_epochs(session: Session, settings: Settings) -> dict[str, Epoch]:
     return {name: one for name, one in found.items() if one is not None and one.missing}
 
 
-def _zone(session: Session, settings: Settings) -> ZoneInfo:
-    return ZoneInfo(store.get_plant(session).time_zone or settings.time_zone or "UTC")
-
-
-def _of_fall(session: Session, heliostat: HeliostatRow, settings: Settings) -> Epoch | None:
+def _of_fall(
+    session: Session, heliostat: HeliostatRow, settings: Settings, zone: ZoneInfo
+) -> Epoch | None:
     fall = read_fall(session, heliostat.id, settings)
     if fall is None:
         return None
-    zone = _zone(session, settings)
     rows = store.recent_measurements(session, heliostat, _OF_A_DAY, fall.until)
     days = {row.taken_at.astimezone(zone).date() for row in rows if row.taken_at is not None}
     if fell_with_others(days, others_on(session, heliostat.id, days, zone)):

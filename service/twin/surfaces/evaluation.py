@@ -106,8 +106,8 @@ def evaluate_surface(
 def evaluate_first_surface(runtime: Runtime, twin: HeliostatContext, new: NewSurface) -> Evaluation:
     """Compare a predicted surface with the ideal mirror, if no surface is active.
 
-    At least `MIN_HELD_OUT` held-out photographs decide. If there are fewer, photographs that the
-    surface was computed from are added, and the reason says so.
+    At least `MIN_HELD_OUT` held-out photographs decide. If there are fewer, surfaces from parts of
+    the photographs judge the rest, and the reason says so.
     """
     judged = _judge(runtime, twin, None, new)
     is_trusted = new.trust is None or not new.trust.warnings
