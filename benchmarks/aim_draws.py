@@ -18,10 +18,10 @@ import yaml
 
 from benchmarks.aims import DNI, SUN, trace
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.field import FieldRequest, trace_field
 from model.aiming.bound import bound_power
 from model.aiming.plan import AimPlan, plan_aims
 from service.base.progress import no_progress
-from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from tests.service.sources.plant_files import gemasolar
 

@@ -15,14 +15,14 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.aim import trace_kernels
+from heliotwin.field import FieldRequest
 from model.aiming.kernels import Kernels
 from model.aiming.plan import AimPlan, plan_aims, single_aim
 from model.aiming.uncertainty import judged_on, plan_uncertainty
 from model.plant import Heliostat
 from model.surface import control_points
 from service.base.progress import no_progress
-from service.cli.aim import trace_kernels
-from service.cli.field import FieldRequest
 from service.sources.plant_file import read_plant
 from tests.service.sources.aim_plant import write_aim_plant
 

@@ -24,14 +24,14 @@ import torch
 from scipy.spatial import cKDTree
 
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.aim import trace_kernels
+from heliotwin.field import FieldRequest, trace_field
 from model.aiming.bound import bound_power
 from model.aiming.k_factor import k_factor_aims
 from model.aiming.kernels import Kernels
 from model.aiming.plan import AimPlan, plan_aims, single_aim
 from model.frames import sun_direction
 from service.base.progress import no_progress
-from service.cli.aim import trace_kernels
-from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_template import staggered_layout
 from tests.service.sources.plant_files import gemasolar

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from benchmarks.record import log_row, recording
+from heliotwin.aim import trace_kernels
+from heliotwin.field import FieldRequest, trace_field
 from model.aiming.kernels import Kernels
 from model.aiming.plan import DRAWS, AimPlan, plan_aims
 from model.frames import sun_direction
 from service.base.progress import no_progress
-from service.cli.aim import trace_kernels
-from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.artist_export import write_artist
 from service.sources.plant_template import staggered_layout

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.record import log_row, recording
+from heliotwin.folder_store import open_folder
 from service.base.settings import Settings
-from service.cli.folder_store import open_folder
 from service.sources.folder import read_folder
 from service.twin.studies.camera_watch import FIGURES, CameraChange, find_camera_change
 

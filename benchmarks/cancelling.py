@@ -21,9 +21,9 @@ from benchmarks import data_folder
 from benchmarks.fleet import Field
 from benchmarks.load import HELIOSTATS, SUN, import_two
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.demo.plant import ORIGIN, properties
 from model.plant import Plant
 from service import store as stored
-from service.cli.demo_plant import ORIGIN, properties
 from service.store.database import Database
 from tests.faults.harness import Process, Store, new_store
 

@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from benchmarks import data_folder
 from benchmarks.folders import read_observations, read_photographs
 from benchmarks.record import log_row, recording
+from heliotwin.folder import predict_folder, surface_errors
+from heliotwin.folder_study import study_folder
 from model.effects import CATALOGUE, Effect, effect_from_json
 from model.forecast import View
 from model.metrics import flux_accuracies, flux_accuracy
@@ -31,8 +33,6 @@ from model.study import FluxImage, Study, StudyOptions, study_to_json
 from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
 from model.study.parameters import ParameterVector, Term
-from service.cli.folder import predict_folder, surface_errors
-from service.cli.folder_study import study_folder
 from service.sources.folder import measured_heights, read_folder
 from training.render import CleanCamera, SceneSampler, load_field, places
 from training.surfaces import load_part

@@ -94,7 +94,7 @@ def main() -> None:
     folder = read_folder(data_folder().parent / "stj-years")
     surface = folder.measured_surface("AA39")
     assert surface is not None
-    points, degree = surface
+    points, degree = surface[:2]
     crops = [one for one in folder.measurements("AA39") if "cropped" in one.images][
         :: options.every
     ]

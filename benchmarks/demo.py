@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.record import log_row, recording
-from service.cli.demo import run_demos
+from heliotwin.cli.demo import run_demos
 
 
 def main(data: Path | None) -> None:

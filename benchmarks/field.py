@@ -58,7 +58,7 @@ PATHS = {
     "photographs on a target without any": "/photographs?target=upper",
     "photographs of a heliostat": "/photographs?heliostat=H00012",
     "photographs of a year ago": "/photographs?since=2025-01-01&until=2025-12-31",
-    "photographs, far back": "/photographs?before=2000",
+    "photographs, far back": "/photographs?after=2000",
     "names": "/v1/heliostats?limit=100",
     "names, by a part": "/v1/heliostats?limit=100&search=99",
     "the field over REST": "/v1/field?limit=100&show=flagged",

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.demo.plant import ORIGIN, properties
 from model.fleet import Superposition, aligned_field, superpose, tiles
 from model.frames import sun_direction
 from model.plant import Cylinder, Heliostat, Plant, Receiver, TargetPlane
@@ -30,7 +31,6 @@ from model.surface import control_points
 from model.tracing import Optics
 from service import store
 from service.base.settings import Settings
-from service.cli.demo_plant import ORIGIN, properties
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker

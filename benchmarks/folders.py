@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from heliotwin.folder import observations_of
+from heliotwin.folder_store import open_folder
+from heliotwin.folder_study import photographs_of
 from model.imaging import ImageKind
 from model.observation import Observation
 from model.pointing import Reading
 from model.study import FluxImage
-from service.cli.folder import observations_of
-from service.cli.folder_store import open_folder
-from service.cli.folder_study import photographs_of
 from service.sources.documents import IMAGE_KINDS
 from service.sources.folder import MeasurementFolder
 from service.twin.heliostats.measurements import AcceptedMeasurement, accepted_measurement

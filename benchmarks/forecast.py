@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks import data_folder
 from benchmarks.record import Estimate, log_row, recording
-from service.cli.folder_forecast import forecast_folder
+from heliotwin.folder_forecast import forecast_folder
 from service.sources.folder import read_folder
 
 GOAL = ">= 0.855"

@@ -45,6 +45,7 @@ from service.store.recovery.backup import images_of
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
 from service.twin.alarms.field_overview import read_summaries
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import light_watts
 from service.twin.photographs.ingest import measurement_row
 from service.twin.runtime import operations
@@ -230,31 +231,31 @@ class Filler:
                     )
 
     def _forecast(self, number: int, at: datetime, flux: bytes) -> ForecastRow:
-        plane = {
-            "center": [0.0, 0.0, 50.0],
-            "normal": [0.0, 1.0, 0.0],
-            "up": [0.0, 0.0, 1.0],
-            "width": 8.0,
+        document = {
+            "sun": {"azimuth_deg": 200.0, "elevation_deg": 45.0},
+            "at": None,
+            "aim_point_m": None,
+            "motor_position": None,
+            "dni_w_m2": 1000.0,
+            "window_m": None,
+            "normalised": False,
+            "plane": receiver_as_json(store.target_plane(self.target)),
+            "resolution": [256, 256],
+            "unit": "W/m2",
+            "peak_w_m2": 9e3,
+            "power_w": 8e3,
+            "center_of_mass_m": None,
+            "losses": light_watts(Losses(8.2, *[0.9] * 8), 1000.0),
+            "model_version": "1:none",
+            "warnings": [],
         }
-        row = ForecastRow(
-            heliostat_id=self.heliostats[number % HELIOSTATS].id, target_name=self.target.name
+        return ForecastRow(
+            heliostat_id=self.heliostats[number % HELIOSTATS].id,
+            target_name=self.target.name,
+            document=document,
+            flux=flux,
+            created_at=at,
         )
-        row.plane, row.flux, row.model_version, row.created_at = (
-            plane | {"height": 7.0},
-            flux,
-            "1:none",
-            at,
-        )
-        row.sun_azimuth_deg, row.sun_elevation_deg, row.dni_w_m2 = 200.0, 45.0, 1000.0
-        row.losses = dict(light_watts(Losses(8.2, *[0.9] * 8), row.dni_w_m2))
-        row.normalised, row.rows, row.columns, row.peak_w_m2, row.power_w = (
-            False,
-            256,
-            256,
-            9e3,
-            8e3,
-        )
-        return row
 
     def jobs(self) -> None:
         """Predictions of a few heliostats, each a step."""

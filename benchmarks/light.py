@@ -42,6 +42,7 @@ from benchmarks import data_folder
 from benchmarks.folders import read_observations
 from benchmarks.record import Estimate, log_row, recording
 from benchmarks.years import interval
+from heliotwin.folder import surface_errors
 from model.forecast import View, align
 from model.images import FLUX_SIZE, FLUX_WINDOW, clipped_alike, normalized
 from model.imaging import Camera, MeasuredFlux, center_of_mass, flux_window, measure
@@ -59,7 +60,6 @@ from model.tracing import Optics, Scene, Window, trace
 from model.tracing.alignment import align_to_spots
 from model.tracing.convolution import central_rays
 from service.base.choices import Method
-from service.cli.folder import surface_errors
 from service.sources.decode import decode_image
 from service.sources.documents import Measurement
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder

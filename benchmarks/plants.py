@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.field import FieldRequest, trace_field
 from model.fleet import Losses, Superposition, aligned_field, field_losses, superpose, tiles
 from model.frames import sun_direction
 from model.heliostat_type import Canting, HeliostatType, MountDesign, facet_grid
@@ -32,7 +33,6 @@ from model.sunshape.buie import chi_of_csr
 from model.surface import control_points
 from model.tracing import Optics
 from service.base.progress import no_progress
-from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import read_plant
 from tests.service.sources import plant_files
 

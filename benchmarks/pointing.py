@@ -44,6 +44,11 @@ TRIALS = 40
 # Times at which a clock is put wrong.
 CLOCK_TRIALS = 12
 
+# Windows of measurements that calibrate, places of the windows, and measurements that follow each.
+FORWARD_KEPT, FORWARD_PLACES, FORWARD_JUDGES = (6, 12, 24, 48), 8, 4
+# A heliostat has moved if it is off by more standard deviations (`service.twin.pointing.errors`).
+MOVED_STD = 5.0
+
 # How often the mounts are calibrated again as the last third comes in.
 PARTS = 4
 
@@ -127,13 +132,9 @@ def covered(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) ->
     """Share of judges within their 90 % ellipse."""
     inside = []
     for name, own in judged.items():
-        motors, suns, spots = (
-            np.array([getattr(one, key) for one in own]) for key in ("motors", "sun", "spot")
-        )
-        days = np.array([one.day for one in own])
-        cov = spot_covariance(mounts[name], plant.heliostats[name], motors, suns, spots, days)
-        off = pointing_error(plant.heliostats[name], mounts[name], own)
-        inside.extend(off**2 < 4.605 * np.trace(cov, axis1=1, axis2=2) / 2)
+        std = standard_deviations(plant, mounts[name], name, own)
+        off = 1e3 * pointing_error(plant.heliostats[name], mounts[name], own)
+        inside.extend(off**2 < 4.605 * std**2)
     return float(np.mean(inside))
 
 
@@ -239,6 +240,60 @@ def five_only(plant: Plant, many: Series) -> dict[str, Array]:
             found.append(errors_mrad(plant, mounts, {name: own[begin + 5 : begin + 35]})[name])
         errors[name] = np.concatenate(found)
     return errors
+
+
+def forward(plant: Plant) -> None:
+    """Predicted intervals of pointing errors, by measurements that follow those of calibrations."""
+    print("| kept | all | not moved | not moved, within 5 days | moved | measurements |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for kept in FORWARD_KEPT:
+        inside, moved, apart = list[Array](), list[Array](), list[Array]()
+        for place in np.linspace(0, 1, FORWARD_PLACES):
+            known, judged = {}, {}
+            for name, own in plant.readings.items():
+                begin = round(place * (len(own) - kept - FORWARD_JUDGES))
+                is_long = len(own) >= max(LEAST, kept + FORWARD_JUDGES)
+                known[name] = own[begin : begin + kept] if is_long else own
+                if is_long:
+                    judged[name] = own[begin + kept : begin + kept + FORWARD_JUDGES]
+            mounts, _ = plant.calibrate(known)
+            for name, errors in errors_mrad(plant, mounts, judged).items():
+                mount, own = mounts[name], judged[name]
+                if mount.prediction is None:
+                    continue
+                low, high = 1e3 * mount.prediction.low, 1e3 * mount.prediction.high
+                inside.append((errors >= low) & (errors <= high))
+                moved.append(errors > MOVED_STD * standard_deviations(plant, mount, name, own))
+                apart.append(np.array([one.day for one in own]) - known[name][-1].day)
+        held, has_moved, days = (np.concatenate(one) for one in (inside, moved, apart))
+        cells = {
+            "all [%]": 100 * held.mean(),
+            "not moved [%]": Estimate(100 * held[~has_moved].mean(), goal=">= 85"),
+            "not moved, within 5 days [%]": 100 * held[~has_moved & (days < 5)].mean(),
+            "moved [%]": 100 * has_moved.mean(),
+        }
+        values = [f"{getattr(one, 'value', one):.0f}" for one in cells.values()]
+        print(f"| {kept} | {' | '.join(values)} | {len(held)} |")
+        log_row(
+            "Later spots in the predicted intervals of pointing errors",
+            f"{kept} measurements kept",
+            cells,
+            n=len(held),
+            of="measurements",
+            compared_with="measured spots",
+        )
+
+
+def standard_deviations(
+    plant: Plant, mount: CalibratedMount, name: str, own: Sequence[Reading]
+) -> Array:
+    """Standard deviations [mrad] of a mount's forecasts, per direction."""
+    motors, suns, spots = (
+        np.array([getattr(one, key) for one in own]) for key in ("motors", "sun", "spot")
+    )
+    days = np.array([one.day for one in own])
+    cov = spot_covariance(mount, plant.heliostats[name], motors, suns, spots, days)
+    return 1e3 * np.sqrt(np.trace(cov, axis1=1, axis2=2) / 2)
 
 
 def with_step(
@@ -562,7 +617,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path, nargs="+", default=default)
     parser.add_argument(
         "--only",
-        choices=("accuracy", "steps", "clock", "covariates", "spots", "speed", "picture"),
+        choices=(
+            "accuracy",
+            "forward",
+            "steps",
+            "clock",
+            "covariates",
+            "spots",
+            "speed",
+            "picture",
+        ),
         nargs="*",
     )
     parser.add_argument("--out", type=Path, default=Path("results/pointing.png"))
@@ -570,6 +634,7 @@ def main() -> None:
     plant = Plant(options.data)
     parts: dict[str, Callable[[], None]] = {
         "accuracy": lambda: accuracy(plant),
+        "forward": lambda: forward(plant),
         "steps": lambda: steps(plant),
         "clock": lambda: clocks(plant),
         "covariates": lambda: covariates(plant),

@@ -37,7 +37,7 @@ from benchmarks.study import (
     run,
     upper_bound,
 )
-from service.cli.folder_study import study_folder
+from heliotwin.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.undeclared.adapter import write_folder
 from tests.undeclared.camera import empty_targets

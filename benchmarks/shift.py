@@ -4,17 +4,22 @@ The demonstration's generator makes fields over eight weeks with every kind of f
 strong or weak, and fields without a fault. A robot takes the first action that REST offers for each
 alarm, studies and their adoption included, until nothing is offered. Photographs of two further
 weeks, which the store never gets, judge each action: a copy of the store forecasts them before and
-after. The oracle is the same field with nothing but its changed mirrors, which were always so.
+after. The oracle is the same field with nothing but its changed mirrors, which were always so. Its
+surfaces of heliostats that have faults are refined, as the robot refines them.
+
+``results/shift.json`` is written after each field, so an interrupted run keeps what it has.
 """
 
 import argparse
+import re
 import shutil
 import tempfile
 import threading
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from statistics import fmean as mean
@@ -25,13 +30,13 @@ import numpy as np
 from fastapi.testclient import TestClient
 
 from benchmarks.record import log_row, proportion, recording
+from heliotwin.demo import field as demo_field
+from heliotwin.demo.field import Fault, PlannedPhotograph
 from model.ephemeris import sun_positions
 from model.imaging.light import Srgb
 from model.plant import Plant
 from model.prior import prior_of
 from service.base.settings import Settings
-from service.cli import demo_field
-from service.cli.demo_field import Fault, PlannedPhotograph
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.folder import read_folder
@@ -199,8 +204,11 @@ def work(runtime: Runtime) -> None:
         pass
 
 
-def fill(root: Path, store: Path, case: Case) -> None:
-    """Import a part, make surfaces and mounts, and receive the rest one by one."""
+def fill(root: Path, store: Path, case: Case, *, oracle: bool = False) -> None:
+    """Import a part, make surfaces and mounts, and receive the rest one by one.
+
+    The oracle refines surfaces of heliostats with faults, from all photographs.
+    """
     end = max(one.taken_at for one in case.photographs)
     begin, unseen = (end - timedelta(days=days) for days in (ARCHIVED, UNSEEN))
     older = [one for one in case.photographs if one.taken_at < begin]
@@ -215,6 +223,10 @@ def fill(root: Path, store: Path, case: Case) -> None:
         work(runtime)
         write(root, case, newer)
         give(runtime, root, newer)
+        faulty = sorted({name for one in case.faults for name in one.heliostats})
+        if oracle and faulty:
+            refined = {"heliostats": faulty, "method": "refined"}
+            sent(client, "POST", "/v1/jobs/predictions", refined)
         work(runtime)
 
 
@@ -255,18 +267,33 @@ def judge(store: Path, unseen: Path, photographs: Sequence[PlannedPhotograph]) -
 
 
 def offers(client: TestClient) -> list[tuple[str | None, dict[str, Any]]]:
-    """The first offer for each alarm: of its plant or of its heliostat, with the heliostat."""
-    found: dict[str | None, dict[str, Any]] = {}
+    """The first offer for each alarm, of its common cause, itself or its heliostat.
+
+    Heliostats without a surface need no alarm; the page of the field lists them.
+    """
+    common = client.get("/v1/alarms/causes").json()["items"]
+    found: dict[str, tuple[str | None, dict[str, Any]]] = {}
     for alarm in client.get("/v1/alarms", params={"limit": 500}).json()["items"]:
-        name = alarm["heliostat"]
-        if name in found:
-            continue
-        path = "/v1/alarms/causes" if name is None else f"/v1/heliostats/{name}/causes"
-        causes = client.get(path).json()["items"]
-        offered = next((one["offer"] for one in causes if one.get("offer")), None)
-        if offered is not None:
-            found[name] = offered
-    return list(found.items())
+        name, offer = alarm["heliostat"], alarm["offer"]
+        shared = [one for one in common if alarm["id"] in one["ids"]]
+        if shared:
+            name, offer = None, shared[0]["offer"]
+        elif offer is None and name is not None:
+            offer = first_offer(client, name)
+        if offer is not None:
+            found.setdefault(str(offer), (name, offer))
+    for one in client.get("/v1/heliostats", params={"limit": 500}).json()["items"]:
+        name = one["name"]
+        answer = client.get(f"/v1/heliostats/{name}/surfaces/current")
+        if answer.status_code == 404 and (offer := first_offer(client, name)) is not None:
+            found.setdefault(str(offer), (name, offer))
+    return list(found.values())
+
+
+def first_offer(client: TestClient, name: str) -> dict[str, Any] | None:
+    """What the likeliest cause of a heliostat offers that offers something."""
+    causes = client.get(f"/v1/heliostats/{name}/causes").json()["items"]
+    return next((one["offer"] for one in causes if one["offer"]), None)
 
 
 class Action(NamedTuple):
@@ -278,31 +305,174 @@ class Action(NamedTuple):
 
 
 def run_shift(
-    store: Path, unseen: Path, photographs: Sequence[PlannedPhotograph], most: int
+    store: Path, unseen: Path, photographs: Sequence[PlannedPhotograph], most: int, until_s: float
 ) -> tuple[list[Action], dict[str, float]]:
-    """Take offers until none is left; the change of accuracy [1] by each, and all at the end."""
+    """Take offers until none is left or the time is over.
+
+    Returns the change of accuracy [1] by each, and the accuracies at the end.
+    """
     done, changes = set[str](), list[Action]()
     before = judge(store, unseen, photographs)
-    for _ in range(most):
+    while len(changes) < most and time.monotonic() < until_s:
         with service_on(store) as (client, runtime):
-            left = [
-                (name, offer) for name, offer in offers(client) if str((name, offer)) not in done
-            ]
+            left = [one for one in offers(client) if str(one) not in done]
             if not left:
                 break
             name, offer = left[0]
-            done.add(str((name, offer)))
-            answer = client.request(offer["method"], offer["path"], json=offer["body"])
-            print(name, offer["label"], answer.status_code, flush=True)
+            done.add(str(left[0]))
+            sent(client, offer["method"], offer["path"], offer["body"])
+            print(f"{datetime.now():%H:%M:%S}", name, offer["label"], flush=True)
             work(runtime)
         some = [one for one in photographs if name is None or one.mirror.name == name]
         after = before | judge(store, unseen, some)
         gains = {one: after[one] - before.get(one, 0.0) for one in after}
-        field = mean(after.values()) - mean(before.values())
+        change = mean(after.values()) - mean(before.values())
         label = f"{name or 'plant'}: {offer['label']}"
-        changes.append(Action(label, gains.get(name, field), min(field, *gains.values())))
+        worst = min(change, gains[name]) if name in gains else change
+        changes.append(Action(label, gains.get(name or "", change), worst))
+        print(f"{100 * changes[-1].gain:+.2f} points", flush=True)
         before = after
     return changes, before
+
+
+# --- what is right at the end
+# --------------------------------------------------------------------------------------------------
+
+_BETWEEN = re.compile(r"between (\S+ \S+) UTC and (\S+ \S+) UTC")
+_DATED = {"facet canted": "fell", "soiled": "dimmed", "drives stepped": "moved"}
+
+
+def dates(client: TestClient, case: Case) -> list[bool]:
+    """Whether the interval of each dated alarm holds the first photograph after its change."""
+    found = []
+    for alarm in client.get("/v1/alarms", params={"limit": 500}).json()["items"]:
+        for fault in case.faults:
+            is_of = alarm["heliostat"] in fault.heliostats
+            if is_of and _DATED.get(fault.kind) == alarm["reason"]:
+                ends = _BETWEEN.search(alarm["message"])
+                assert ends is not None, alarm["message"]
+                begin, end = (datetime.fromisoformat(f"{one}+00:00") for one in ends.groups())
+                first = first_of(case, fault)
+                found.append(begin < first < end + timedelta(minutes=1))
+    return found
+
+
+def first_of(case: Case, fault: Fault) -> datetime:
+    """When the first photograph was taken that a fault acts on."""
+    return min(one.taken_at for one in case.photographs if fault.kind in one.faults)
+
+
+def right(client: TestClient, case: Case, fault: Fault) -> bool:
+    """Whether a fault ends with the right state: surface, effect, mount, times, exclusions."""
+    listed = client.get("/v1/alarms", params={"limit": 500}).json()["items"]
+    names = fault.heliostats or tuple(case.plant.heliostats)
+    alarms = {
+        one["reason"] for one in listed if one["heliostat"] in names and not one["acknowledged_by"]
+    }
+    uncalibrated = [one for one in listed if one["heliostat"] in names and one["offer"]]
+    effects = client.get("/v1/models/current").json()["effects"]
+    now_acting = [one for one in effects if not (one.get("scope") or {}).get("until")]
+    epochs = {name: epoch for name in names if (epoch := _epoch(client, name))}
+    canted = {name for one in case.faults if one.kind == "facet canted" for name in one.heliostats}
+    match fault.kind:
+        case "facet canted":
+            begun = epochs.get(names[0])
+            first = first_of(case, fault)
+            is_known = any(one["name"] == "facet_canting" for one in now_acting)
+            return is_known or (begun is not None and abs(begun - first) < timedelta(days=3))
+        case "soiled":
+            return "dimmed" not in alarms and not epochs
+        case "drives stepped" | "drifting" | "target moved":
+            return not [one for one in uncalibrated if one["reason"] in ("moved", "pointing")]
+        case "clock":
+            return "sun_contradicts_time" not in alarms
+        case "neighbour":
+            path = f"/v1/heliostats/{names[0]}/measurements"
+            stored = client.get(path, params={"limit": 500}).json()["items"]
+            out = {one["id"] for one in stored if one["reason"] == "excluded"}
+            photographs = [one for one in case.photographs if one.mirror.name == names[0]]
+            return out == {str(one.number) for one in photographs if "neighbour" in one.faults}
+        case "no surface":
+            answer = client.get(f"/v1/heliostats/{names[0]}/surfaces/current")
+            return bool(answer.status_code == 200)
+        case "hazy":
+            return not epochs.keys() - canted and not [
+                one
+                for one in now_acting
+                if one["name"] in ("sun_shape", "slope_error", "camera_blur")
+            ]
+        case "camera changed":
+            return not epochs.keys() - canted and any(
+                one["name"].startswith("camera_") for one in now_acting
+            )
+    raise ValueError(fault.kind)
+
+
+def _epoch(client: TestClient, name: str) -> datetime | None:
+    """Since when the active surface's epoch is."""
+    answer = client.get(f"/v1/heliostats/{name}/surfaces/current")
+    since = answer.json().get("epoch_since") if answer.status_code == 200 else None
+    return None if since is None else datetime.fromisoformat(since)
+
+
+@dataclass
+class Result:
+    """What the fields of a strength show."""
+
+    actions: list[Action] = field(default_factory=list)
+    rights: list[tuple[str, bool]] = field(default_factory=list)
+    dates: list[bool] = field(default_factory=list)
+    gains: list[float] = field(default_factory=list)
+    gaps: list[float] = field(default_factory=list)
+
+    def log(self, word: str) -> None:
+        """Log the row of a strength."""
+        bad = [one for one in self.actions if one.worst < -WORSE]
+        are_right = [is_right for _, is_right in self.rights]
+        cells = {
+            "actions": len(self.actions),
+            "of them made unseen photographs worse": len(bad),
+            "faults with the right state [%]": proportion(sum(are_right), len(are_right))
+            if are_right
+            else None,
+            "dates in their interval [%]": proportion(sum(self.dates), len(self.dates))
+            if self.dates
+            else None,
+            "gain [points]": 100 * mean(self.gains),
+            "below the oracle [points]": 100 * mean(self.gaps),
+        }
+        log_row("A robot takes what alarms offer", word, cells, n=len(self.gains), of="fields")
+
+
+def try_field(
+    result: Result, root: Path, options: argparse.Namespace, seed: int, word: str
+) -> None:
+    """Let the robot act on a field, and add what it shows to the result."""
+    strength = {"strong": 0, "weak": 1, "none": None}[word]
+    size = (seed, strength, options.heliostats, options.each)
+    case = make_case(root / "plant", *size)
+    end = max(one.taken_at for one in case.photographs)
+    later = [one for one in case.photographs if one.taken_at >= end - timedelta(days=UNSEEN)]
+    fill(root / "plant", root / "store", case)
+    shutil.copytree(root / "plant", root / "unseen")
+    write(root / "unseen", case, later)
+    begun = judge(root / "store", root / "unseen", later)
+    with service_on(root / "store") as (client, _):
+        result.dates += dates(client, case)
+    until_s = time.monotonic() + 60 * options.minutes
+    made, ended = run_shift(root / "store", root / "unseen", later, options.most, until_s)
+    with service_on(root / "store") as (client, _):
+        found = [(one.kind, right(client, case, one)) for one in case.faults]
+    print(
+        f"{word}, seed {seed}:", ", ".join(f"{k} {'right' if ok else 'wrong'}" for k, ok in found)
+    )
+    ideal = make_case(root / "ideal", *size, oracle=True)
+    fill(root / "ideal", root / "oracle", ideal, oracle=True)
+    best = judge(root / "oracle", root / "unseen", later)
+    result.rights += found
+    result.actions += made
+    result.gains.append(mean(ended.values()) - mean(begun.values()))
+    result.gaps.append(mean(best.values()) - mean(ended.values()))
 
 
 def main() -> None:
@@ -311,48 +481,24 @@ def main() -> None:
     parser.add_argument("--heliostats", type=int, default=60)
     parser.add_argument("--each", type=int, default=24, help="photographs of a heliostat")
     parser.add_argument("--most", type=int, default=60, help="actions of a field")
+    parser.add_argument("--minutes", type=float, default=60, help="time of a field's actions")
     parser.add_argument("--strengths", nargs="+", default=["strong", "weak", "none"])
     options = parser.parse_args()
-    table = "A robot takes what alarms offer"
-    with recording("shift"):
+    results = dict[str, Result]()
+    for seed in range(options.seeds):
         for word in options.strengths:
-            strength = {"strong": 0, "weak": 1, "none": None}[word]
-            changes, gained = list[Action](), list[float]()
-            gaps, untouched = list[float](), 0
-            for seed in range(options.seeds):
-                with tempfile.TemporaryDirectory() as folder:
-                    root = Path(folder)
-                    size = (seed, strength, options.heliostats, options.each)
-                    case = make_case(root / "plant", *size)
-                    end = max(one.taken_at for one in case.photographs)
-                    later = [
-                        one
-                        for one in case.photographs
-                        if one.taken_at >= end - timedelta(days=UNSEEN)
-                    ]
-                    fill(root / "plant", root / "store", case)
-                    shutil.copytree(root / "plant", root / "unseen")
-                    write(root / "unseen", case, later)
-                    begun = judge(root / "store", root / "unseen", later)
-                    made, ended = run_shift(root / "store", root / "unseen", later, options.most)
-                    changes += made
-                    untouched += not made
-                    gained.append(mean(ended.values()) - mean(begun.values()))
-                    ideal = make_case(root / "ideal", *size, oracle=True)
-                    fill(root / "ideal", root / "oracle", ideal)
-                    best = judge(root / "oracle", root / "unseen", later)
-                    gaps.append(mean(best.values()) - mean(ended.values()))
-            bad = [one for one in changes if one.worst < -WORSE]
-            for one in changes:
-                print(f"{100 * one.gain:+.2f} points  {one.label}")
-            cells = {
-                "actions": len(changes),
-                "of them made unseen photographs worse": len(bad),
-                "fields without an action": proportion(untouched, options.seeds),
-                "gain [points]": 100 * mean(gained),
-                "below the oracle [points]": 100 * mean(gaps),
-            }
-            log_row(table, word, cells, n=options.seeds)
+            result = results.setdefault(word, Result())
+            with tempfile.TemporaryDirectory() as folder:
+                try_field(result, Path(folder), options, seed, word)
+            with recording("shift"):
+                for done, one in results.items():
+                    one.log(done)
+    for word, result in results.items():
+        for action in result.actions:
+            print(f"{word}: {100 * action.gain:+.2f} points  {action.label}")
+        for kind in dict.fromkeys(kind for kind, _ in result.rights):
+            are_right = [is_right for one, is_right in result.rights if one == kind]
+            print(f"{word}: {kind}: {sum(are_right)} of {len(are_right)} right")
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ import torch
 from scipy import stats
 
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.field import FieldRequest, trace_field
 from service.base.progress import no_progress
-from service.cli.field import FieldRequest, trace_field
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.solarpilot import read_solarpilot
 

@@ -2,11 +2,12 @@
 benchmarks.study``.
 
 Every disturbance of `tests.undeclared.world` at three strengths, pairs of them, and clean sets;
-each seed is another plant. Each case adds a line of JSON to ``OUT/cases.jsonl``; a later call does
-what is missing, or was answered by another state of the code. ``OUT/study.md`` and
-``OUT/matrix.png`` show them all. With ``--folders`` the sets of ``../shared/undeclared``, whose
-effects are not known here, are studied instead; with ``--moving`` worlds whose effects move spots,
-with and without what encoders said.
+each seed is another plant. With ``--calibrate`` each effect of the catalogue is taken out of it in
+turn, and its sets are studied without it: the verdict's thresholds are chosen by these. Each case
+adds a line of JSON to ``OUT/cases.jsonl``; a later call does what is missing, or was answered by
+another state of the code. ``OUT/study.md`` and ``OUT/matrix.png`` show them all. With ``--folders``
+the sets of ``../shared/undeclared``, whose effects are not known here, are studied instead; with
+``--moving`` worlds whose effects move spots, with and without what encoders said.
 """
 
 import argparse
@@ -30,16 +31,16 @@ from numpy.typing import NDArray
 
 from benchmarks import data_folder
 from benchmarks.record import log_row, proportion, recording
+from heliotwin.folder_study import study_folder
 from model.effects import CATALOGUE as KINDS
 from model.metrics import flux_accuracies
 from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, study, study_to_json
 from model.study.flux_images import Forecaster
-from service.cli.folder_study import study_folder
 from service.sources.folder import read_folder
 from tests.undeclared.adapter import effects_of, flux_images
 from tests.undeclared.generator import MeasurementSet, generate
-from tests.undeclared.world import CATALOGUE, MOVING, OUTSIDE
+from tests.undeclared.world import CATALOGUE, LIVES_IN, MOVING, OUTSIDE, UNSEEN
 
 Record = dict[str, Any]
 Array = NDArray[np.float64]
@@ -56,7 +57,15 @@ PAIRS = (
 
 SHAPED = tuple(name for name in CATALOGUE if not KINDS[name].only_moves)
 
-CASES = ("clean", *SHAPED, *OUTSIDE, *PAIRS)
+NAMELESS = (*OUTSIDE, *UNSEEN)
+
+CASES = ("clean", *SHAPED, *NAMELESS, *PAIRS)
+
+TAKEN_OUT = " taken out"
+"""Ends the name of a case that is studied without its effect."""
+
+SHARES_LEFT = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.67)
+"""Thresholds that ``--calibrate`` compares."""
 
 QUIET = ("clean", "calm")
 """Those that have no strength."""
@@ -78,9 +87,13 @@ class Case:
 def answer(case: Case) -> Record:
     """The study's answer to a case, with the truth beside it."""
     torch.set_num_threads(1)
-    made = generate(case.name, case.level, case.seed)
+    name = case.name.removesuffix(TAKEN_OUT)
+    made = generate(name, case.level, case.seed)
+    without = {name} if case.name.endswith(TAKEN_OUT) else set()
+    names = tuple(one for one in KINDS if one not in without)
+    options = StudyOptions(candidates=names)
     start = process_time()
-    found = study(flux_images(made), JUELICH_MODEL)
+    found = study(flux_images(made), JUELICH_MODEL, options)
     seconds = process_time() - start
     report = study_to_json(found)
     true, change = upper_bound(made, found)
@@ -96,6 +109,8 @@ def answer(case: Case) -> Record:
         "noise": report["noise_floor"],
         "unexplained": report["unexplained_share"],
         "incomplete": found.has_unexplained_error,
+        "contradicted_by": found.contradicted_by,
+        "discrepancy": report["discrepancy"],
         "lookalikes": [effect["lookalikes"] for effect in report["effects"]],
         "errors": [error for effect in report["effects"] for error in errors(effect, made.truth)],
         "truth": made.truth,
@@ -226,16 +241,21 @@ def column(record: Record) -> str:
     return record["found"][0] if record["verdict"] == "effect" else record["verdict"]
 
 
+def is_nameless(record: Record) -> bool:
+    """Whether no effect of the catalogue is the truth."""
+    return record["name"] in NAMELESS or record["name"].endswith(TAKEN_OUT)
+
+
 def first(record: Record) -> bool:
     """Whether the verdict is right, and the first effect one of the true ones."""
-    if record["name"] in OUTSIDE:
+    if is_nameless(record):
         return column(record) == "unexplained"
     return column(record) in ("none" if record["name"] == "clean" else record["name"]).split("+")
 
 
 def among(record: Record) -> bool:
     """Whether all true effects are among those found."""
-    if record["name"] == "clean" or record["name"] in OUTSIDE:
+    if record["name"] == "clean" or is_nameless(record):
         return first(record)
     return set(record["name"].split("+")) <= set(record["found"])
 
@@ -244,6 +264,22 @@ def undecided(record: Record) -> bool:
     """Whether the true effect is not the first, but the report lists it as a look-alike of it."""
     alike = record["lookalikes"][0] if record["lookalikes"] else []
     return not first(record) and bool(set(record["name"].split("+")) & set(alike))
+
+
+def is_clear(record: Record) -> bool:
+    """Whether an undeclared disturbance changes the forecast by more than twice the noise.
+
+    What the model cannot state has the excess error of the declared model as its size.
+    """
+    excess = 1 - record["before"] - record["noise"]
+    return max(record["change"], excess if is_nameless(record) else 0.0) > 2 * record["noise"]
+
+
+def recovered(record: Record) -> float:
+    """Share of the missing accuracy that the discrepancy, or else the effects found, recover."""
+    found = record["discrepancy"]
+    after = record["after"] if found is None else max(record["after"], found["accuracy_after"])
+    return float((after - record["before"]) / (1 - record["before"] - record["noise"]))
 
 
 def percent(values: Sequence[float]) -> str:
@@ -271,14 +307,14 @@ def table(records: Sequence[Record]) -> Iterator[str]:
         if own:
             change = (
                 ""
-                if name == "clean" or name in OUTSIDE
+                if name == "clean" or name in NAMELESS
                 else by_strength(own, lambda r: r["change"], decimal)
             )
             shares = " | ".join(by_strength(own, rule, percent) for rule in (first, among))
             accuracy = " | ".join(
                 by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
             )
-            truth = "" if name in OUTSIDE else by_strength(own, lambda r: r["true"], mean)
+            truth = "" if name in NAMELESS else by_strength(own, lambda r: r["true"], mean)
             cells = dict(
                 zip(("found first [%]", "among those found [%]"), shares.split(" | "), strict=True)
             )
@@ -343,7 +379,8 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
     single = [r for r in records if r["name"] in CATALOGUE]
     large = [r for r in single if r["change"] > 2 * r["noise"]]
     clean = [r for r in records if r["name"] == "clean"]
-    outside = [r for r in records if r["name"] in OUTSIDE]
+    outside = [r for r in records if r["name"] in NAMELESS]
+    pairs = [r for r in records if r["name"] in PAIRS]
     log_summary(large, clean, outside)
     yield f"Noise alone costs {decimal([r['noise'] for r in records])} % of accuracy."
     yield (
@@ -360,18 +397,69 @@ def summary(records: Sequence[Record]) -> Iterator[str]:
         f"Clean sets: {len(clean)}, false alarms"
         f" {percent([r['verdict'] != 'none' for r in clean])} %."
     )
-    if outside:
-        answers = Counter(r["verdict"] for r in outside)
-        rest = [r["incomplete"] for r in outside if r["verdict"] == "effect"]
-        yield (
-            f"Outside the catalogue: {len(outside)} sets, "
-            + ", ".join(f"{v} {n}" for v, n in answers.items())
-            + ";"
-        )
-        yield (
-            f"of those effects {percent(rest)} % are reported with an error that stays unexplained."
-        )
+    for title, some in (
+        ("Outside the catalogue", outside),
+        ("Those that no threshold was chosen on", [r for r in outside if r["name"] in UNSEEN]),
+    ):
+        if some:
+            yield from nameless(title, some)
+    if pairs:
+        refused = [r["verdict"] != "effect" for r in pairs]
+        yield f"Pairs of catalogue effects: {len(pairs)}, refused a name {percent(refused)} %."
     yield f"A study takes {np.median([r['seconds'] for r in records]):.0f} s of one core."
+
+
+def nameless(title: str, records: Sequence[Record]) -> Iterator[str]:
+    """What is said of sets whose truth is outside the catalogue."""
+    answers = Counter(r["verdict"] for r in records)
+    clear = [r for r in records if is_clear(r)]
+    said = [r for r in records if r["discrepancy"] and r["discrepancy"]["lives_in"]]
+    right = [r["discrepancy"]["lives_in"] == LIVES_IN[r["name"]] for r in said]
+    wrong = proportion(answers["effect"], len(records))
+    cells = {
+        "missing accuracy recovered, clear ones [%]": percent([recovered(r) for r in clear]),
+        "where it lives: said [%]": percent([r in said for r in records]),
+        "where it lives: right of those said [%]": percent(right),
+    }
+    low, high = wrong.interval or (0.0, 100.0)
+    yield f"{title}: {len(records)} sets, " + ", ".join(f"{v} {n}" for v, n in answers.items())
+    yield f"  wrong names {wrong.value:.0f} % [{low:.0f}, {high:.0f}]"
+    yield "  " + ", ".join(f"{name} {value}" for name, value in cells.items())
+    log_row(
+        "Effects outside the catalogue",
+        title,
+        {"wrong names [%]": wrong} | cells,
+        n=len(records),
+        of="sets",
+    )
+
+
+def calibration(records: Sequence[Record]) -> Iterator[str]:
+    """Names kept and wrong names at each threshold of the share that effects leave.
+
+    Sets are clear ones of single effects: with the whole catalogue, and without their effect.
+    """
+    clear = [r for r in records if is_clear(r)]
+    true = [r for r in clear if r["name"] in SHAPED and r["name"] in r["found"][:1]]
+    outside = [r for r in clear if r["name"].endswith(TAKEN_OUT)]
+    yield f"{len(true)} sets with the true effect first, {len(outside)} with it taken out"
+    yield "| largest share left | true names kept [%] | wrong names [%] |"
+    yield "| --- | --- | --- |"
+    for share in SHARES_LEFT:
+        kept = [r["unexplained"] <= share and not r["contradicted_by"] for r in true]
+        wrong = [
+            bool(r["found"]) and r["unexplained"] <= share and not r["contradicted_by"]
+            for r in outside
+        ]
+        log_row(
+            "Thresholds of the verdict, by effects that are taken out of the catalogue",
+            f"{share:.2f}",
+            {
+                "true names kept [%]": proportion(sum(kept), len(kept)) if kept else None,
+                "wrong names [%]": proportion(sum(wrong), len(wrong)) if wrong else None,
+            },
+        )
+        yield f"| {share:.2f} | {percent(kept)} | {percent(wrong)} |"
 
 
 def log_summary(
@@ -529,6 +617,11 @@ def main() -> None:
         "--folders", action="store_true", help="study the sets of ../shared/undeclared instead"
     )
     parser.add_argument(
+        "--calibrate",
+        action="store_true",
+        help="study single effects with and without them in the catalogue",
+    )
+    parser.add_argument(
         "--moving",
         action="store_true",
         help="only worlds in which spots are moved, by their motors",
@@ -542,7 +635,9 @@ def main() -> None:
         with recording("study-folders"):
             folders(data_folder().parent / "undeclared")
         return
-    path = options.out / "cases.jsonl"
+    if options.calibrate:
+        options.effects = ",".join([*SHAPED, *(name + TAKEN_OUT for name in SHAPED)])
+    path = options.out / ("calibration.jsonl" if options.calibrate else "cases.jsonl")
     levels = [STRENGTHS.index(name) for name in options.strengths.split(",")]
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     if not options.show:
@@ -550,6 +645,10 @@ def main() -> None:
             list(cases(options.effects.split(","), levels, seeds)), path, options.jobs, answer, line
         )
     records = list(read(path).values())
+    if options.calibrate:
+        with recording("study-calibration"):
+            print("\n".join(calibration(records)))
+        return
     states = len({r["code"] for r in records})
     with recording("study"):
         text = [*summary(records), "", *table(records), "", *parameters(records)]

@@ -36,6 +36,7 @@ from benchmarks import data_folder
 from benchmarks.folders import read_observations
 from benchmarks.record import Estimate, log_row, recording
 from benchmarks.years import interval
+from heliotwin.folder import surface_errors
 from model.images import FLUX_SHAPE, FLUX_WINDOW, normalized
 from model.metrics import WINDOWS, surface_error
 from model.network.predictor import default_predictor
@@ -55,7 +56,6 @@ from model.refinement import RefinementOptions, refine
 from model.surface import heights
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
-from service.cli.folder import surface_errors
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
 from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime import operations

@@ -29,6 +29,7 @@ from scipy.stats import bootstrap
 from benchmarks import data_folder
 from benchmarks.folders import read_photographs
 from benchmarks.record import Estimate, log_row, recording
+from heliotwin.folder_pointing import calibrate_folder
 from model.effects import CATALOGUE, Effect, effect_to_json
 from model.metrics import flux_accuracies
 from model.plant_model import JUELICH_MODEL
@@ -36,7 +37,6 @@ from model.study import FluxImage, Study, StudyOptions, conclude, study, study_t
 from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster
 from model.study.parameters import ParameterVector, Term
-from service.cli.folder_pointing import calibrate_folder
 from service.sources.folder import read_folder
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
-from docs import figures  # noqa: E402  # it needs the path above
+from docs import figures, run_notebooks  # noqa: E402  # they need the path above
 
 project = "heliotwin"
 html_show_copyright = False
@@ -51,7 +51,15 @@ def _insert_figures(_: Sphinx, __: str, source: list[str]) -> None:
     source[0] = figures.fill(source[0])
 
 
+def _write_notebooks(app: Sphinx, error: Exception | None) -> None:
+    if error is None:
+        run_notebooks.write_notebooks(Path(app.outdir) / "notebooks")
+
+
 def setup(app: Sphinx) -> None:
-    """Insert measured figures, and draw equations as MathML, which needs no script."""
+    """Insert measured figures, draw equations as MathML, which needs no script, and write
+    notebooks.
+    """
+    app.connect("build-finished", _write_notebooks)
     app.connect("source-read", _insert_figures)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))

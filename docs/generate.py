@@ -19,10 +19,11 @@ from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
 from docs.python_api import python_api_page
+from docs.run_notebooks import NAMES, recorded
+from heliotwin.cli.main import app as command_line
 from model.effects import CATALOGUE
 from service.base import settings as settings_module
 from service.base.settings import Settings
-from service.cli.main import app as command_line
 from service.sources.plant_schema import json_schema
 from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Runtime
@@ -323,9 +324,6 @@ def roles_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-NOTEBOOKS = ("surfaces_from_photographs", "forecast_anywhere", "hidden_effect")
-
-
 def plant_schema_page() -> str:
     """Every key of ``plant.yaml``, by part."""
     schema: Any = json_schema()
@@ -356,18 +354,16 @@ def _plain_default(field: dict[str, Any]) -> str:
 
 
 def notebook_page(name: str) -> str:
-    """A notebook in Jupytext's percent format as a page; tests execute the notebook."""
-    source = Path(__file__).with_name("notebooks") / f"{name}.py"
-    _, *cells = source.read_text(encoding="utf-8").split("# %%")
+    """A notebook with its recorded outputs as a page; `docs.run_notebooks` records them."""
     parts = []
-    for cell in cells:
-        head, _, body = cell.partition("\n")
-        if "[markdown]" in head:
-            parts.append(re.sub(r"^# ?", "", body.strip(), flags=re.MULTILINE))
-        else:
-            parts.append(f"```python\n{body.strip()}\n```")
-    address = f"docs/notebooks/{name}.py"
-    parts.append(f"The notebook is `{address}`. `jupytext --to ipynb {address}` converts it.")
+    for cell in recorded(name):
+        parts.append(f"```python\n{cell.source}\n```" if cell.is_code else cell.source)
+        parts += [f"```text\n{cell.text}\n```"] if cell.text else []
+        parts += [f"![Picture of this cell](../../images/notebooks/{one})" for one in cell.pictures]
+    ipynb = f'<a href="../../notebooks/{name}.ipynb" download>{name}.ipynb</a>'
+    parts.append(
+        f"The guide has this page as a notebook: {ipynb}. Its source is `docs/notebooks/{name}.py`."
+    )
     return "\n\n".join(parts) + "\n"
 
 
@@ -380,7 +376,7 @@ PAGES: Pages = {
     "roles": roles_page,
     "plant-schema": plant_schema_page,
     "python-api": partial(python_api_page, _prose),
-    **{name: partial(notebook_page, name) for name in NOTEBOOKS},
+    **{name: partial(notebook_page, name) for name in NAMES},
 }
 """Name of each page, and the function that writes it."""
 

@@ -21,12 +21,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from sqlalchemy import select
 
+from heliotwin.cli import demo
+from heliotwin.folder import observations_of
+from heliotwin.folder_store import FolderStore
 from model.images import FLUX_WINDOW
 from service.base.arrays import unpack
 from service.base.settings import Settings
-from service.cli import demo
-from service.cli.folder import observations_of
-from service.cli.folder_store import FolderStore
 from service.drawing.pictures import mirror_heights, of_peak
 from service.sources.folder import read_folder
 from service.store.tables import HeliostatRow, SurfaceRow

@@ -24,6 +24,7 @@ CONTENT: dict[str, dict[str, str]] = {
         "heliotwin.open_plant": "",
         "heliotwin.make_demo": "",
         "heliotwin.plane": "",
+        "heliotwin.to_frame": "",
         "heliotwin.PlantFolder": ALL,
         "heliotwin.Surface": ALL,
         "heliotwin.Flux": ALL,

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from heliotwin.plant import PlantFolder, make_demo, open_plant, plane
-    from heliotwin.results import Comparison, Flux, Photograph, StudyResult, Surface
+    from heliotwin.results import Comparison, Flux, Photograph, StudyResult, Surface, to_frame
     from model.errors import InvalidInputError
     from model.errors import ModelError as HeliotwinError
 
@@ -39,6 +39,7 @@ __all__ = [
     "make_demo",
     "open_plant",
     "plane",
+    "to_frame",
 ]
 
 _PLACES = {

@@ -81,6 +81,14 @@ def _sun_at(at: datetime, origin: ArrayLike) -> Sun:
     return Sun(azimuth_deg=azimuth, elevation_deg=elevation)
 
 
+def moment_of(at: datetime | None) -> datetime | None:
+    """The time of ``--at`` in UTC; `InvalidInputError` for an implausible year."""
+    try:
+        return None if at is None else parse_moment(at)
+    except ValueError as error:
+        raise InvalidInputError(f"--at: {error}") from None
+
+
 def require_heights(z: ArrayLike, facets: int) -> NDArray[np.float64]:
     """Control heights (facets, 8, 8) [m]."""
     heights = _numbers(z)

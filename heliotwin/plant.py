@@ -1,12 +1,13 @@
 """A plant with its photographs: surfaces, forecasts, comparisons and studies."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal, Self
 from weakref import finalize
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from heliotwin.arguments import (
@@ -19,24 +20,24 @@ from heliotwin.arguments import (
     require_resolution,
     resolve_sun,
 )
-from heliotwin.results import Comparison, Flux, Photograph, StudyResult, Surface
+from heliotwin.demo.photographs import IMAGES, RAYS
+from heliotwin.demo.plant import write_plant
+from heliotwin.folder_forecast import agreement, forecast_measurement
+from heliotwin.folder_store import FolderStore, ForecastTarget, open_folder
+from heliotwin.folder_study import study_photographs
+from heliotwin.results import Comparison, Flux, Photograph, StudyResult, Surface, new_axes
 from model.effects import CATALOGUE, Effect
 from model.effects.catalogue import effects_from_json
 from model.errors import InvalidInputError
 from model.plant import Receiver, TargetPlane, require_plane_shape
-from model.study import StudyOptions, study_to_json
+from model.study import StudyOptions
 from model.surface import DEGREE, control_points
 from service.base.choices import Method, require_images
-from service.cli.demo_photographs import IMAGES, RAYS
-from service.cli.demo_plant import write_plant
-from service.cli.folder_forecast import agreement, forecast_measurement
-from service.cli.folder_store import FolderStore, open_folder
+from service.drawing.pictures import draw_places
 from service.sources.documents import IMAGE_KINDS
-from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, read_folder
 from service.store.tables import MeasurementRow
-from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_flux
 from service.twin.heliostats.measurements import accepted_measurement, to_observations
-from service.twin.studies.study import StudyInputs, add_photographs
 from service.twin.surfaces.prediction import choose_observations
 
 
@@ -146,7 +147,7 @@ class PlantFolder:
         self, folder: MeasurementFolder, effects: Sequence[Effect] = (), mounts: Path | None = None
     ) -> None:
         self._folder, self._effects, self._mounts = folder, tuple(effects), mounts
-        self._stores: dict[bool, FolderStore] = {}
+        self._stores: dict[tuple[bool, bool], FolderStore] = {}
         self._stack = ExitStack()
         self.close = finalize(self, self._stack.close)
         """Delete what was measured; also done when the plant is no longer used."""
@@ -172,9 +173,40 @@ class PlantFolder:
         """Heliostats and measurements that could not be read, with the reasons."""
         return self._folder.skipped
 
+    def __repr__(self) -> str:
+        name, targets = self._folder.plant.name, ", ".join(self.targets)
+        return f"PlantFolder({name}: {len(self.heliostats)} heliostats, {targets})"
+
+    def plot(
+        self, values: Mapping[str, float] | None = None, label: str = "", ax: Axes | None = None
+    ) -> Axes:
+        """Draw the field from above, with the tower as a triangle.
+
+        Parameters
+        ----------
+        values : mapping of str to float, optional
+            What the dots are coloured by, by heliostat; heliostats without a value are hollow.
+        label : str
+            What the values are, with their unit.
+        ax : matplotlib.axes.Axes, optional
+            By default those of a new figure.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        axes, shown = new_axes(ax), {self._known(name): v for name, v in (values or {}).items()}
+        plant = self._folder.plant
+        places = np.array([plant.heliostats[name].position[:2] for name in self.heliostats])
+        heights = np.array([shown.get(name, np.nan) for name in self.heliostats], dtype=float)
+        ends = (min(shown.values(), default=0.0), max(shown.values(), default=1.0))
+        draw_places(axes, places, heights, "viridis", ends, label)
+        axes.plot(0, 0, "k^")
+        return axes
+
     def with_effects(self, study: StudyResult) -> "PlantFolder":
-        """The same plant with the effects that a study found in its model."""
-        found = effects_from_json(study.effects)
+        """The same plant with what a study found in its model: effects, or a correction."""
+        found = effects_from_json({**study.report, "effects": study.effects})
         return PlantFolder(self._folder, (*self._effects, *found), self._mounts)
 
     def surface(
@@ -320,18 +352,16 @@ class PlantFolder:
         name = self._known(surface.heliostat)
         receiver = self._receiver(on)
         position, at = resolve_sun(sun, self._folder.plant.origin)
-        request = ForecastRequest(
-            name,
+        wanted = ForecastTarget(
             position,
+            receiver,
             at,
-            receiver=receiver,
-            aim_point_m=None if aim_m is None else require_point("aim_m", aim_m),
+            aim=None if aim_m is None else np.asarray(require_point("aim_m", aim_m)),
             dni_w_m2=require_positive("dni_w_m2", dni_w_m2, "W/m2"),
             resolution=require_resolution(resolution),
         )
-        store = self._store(with_photographs=False)
-        twin, points = store.context(name), surface.control_points
-        traced = trace_flux(store.runtime, twin, points, request, surface.degree)
+        mirror = MeasuredSurface(surface.control_points, surface.degree)
+        traced = self._store(with_photographs=False).trace(name, mirror, wanted)
         is_plane = isinstance(receiver, TargetPlane)
         return Flux(
             traced.flux,
@@ -364,9 +394,7 @@ class PlantFolder:
         rows, store = self._rows(surface.heliostat), self._store()
         twin, found = store.context(surface.heliostat), []
         for row in rows:
-            if row.kind == "flux-centered":
-                continue
-            mirror = (surface.control_points, surface.degree)
+            mirror = MeasuredSurface(surface.control_points, surface.degree)
             traced = forecast_measurement(store, twin, row, mirror)
             taken = accepted_measurement(row, twin.origin)
             agreed = agreement(taken, traced, taken.target)
@@ -410,17 +438,16 @@ class PlantFolder:
         for name in candidates or ():
             require_known("candidates", name, CATALOGUE)
         names = tuple(CATALOGUE) if candidates is None else tuple(candidates)
-        store = self._store()
-        inputs = StudyInputs(skipped=self.skipped | store.refused)
+        store = self._store(with_camera=False)  # the camera is a candidate
         if surfaces is None:
             surfaces = [one for name in self.heliostats if (one := self._measured(name))]
-        for one in surfaces:
-            rows, twin = self._rows(one.heliostat), store.context(one.heliostat)
-            mirror = one.control_points, one.degree
-            add_photographs(store.session, inputs, twin, rows, *mirror, one.images)
+        mirrors = [
+            (self._known(one.heliostat), one.control_points, one.degree, one.images)
+            for one in surfaces
+        ]
+        inputs = store.study_inputs(mirrors, self.skipped | store.refused)
         options = StudyOptions(candidates=names)
-        found = store.runtime.operations.study(inputs.photographs, store.model, options)
-        report = {**study_to_json(found), "skipped": inputs.skipped}
+        report = study_photographs(store, inputs.photographs, inputs.skipped, options).to_json()
         before, after = (report[name]["accuracy_mean"] for name in ("before", "after"))
         effects = report["effects"]
         return StudyResult(report["verdict"], report["conclusion"], effects, before, after, report)
@@ -441,17 +468,23 @@ class PlantFolder:
         if known is None:
             return None
         heights = measured_heights(self._folder.plant.heliostats[heliostat], known)
-        return Surface(heliostat, "measured", heights, *known)
+        return Surface(heliostat, "measured", heights, known.points, known.degree)
 
-    def _store(self, with_photographs: bool = True) -> FolderStore:
-        """The folder in a temporary store, with or without measured photographs."""
+    def _store(self, with_photographs: bool = True, with_camera: bool = True) -> FolderStore:
+        """The folder in a temporary store, with or without measured photographs.
+
+        They choose the camera if none is declared, except without ``with_camera``.
+        """
         if not self.close.alive:
             raise InvalidInputError("the plant is closed; open it again by open_plant")
-        if with_photographs not in self._stores:
+        key = (with_photographs, with_camera)
+        if key not in self._stores:
             kinds = IMAGE_KINDS if with_photographs else None
-            opened = open_folder(self._folder, kinds, self._effects, self._mounts)
-            self._stores[with_photographs] = self._stack.enter_context(opened)
-        return self._stores[with_photographs]
+            opened = open_folder(
+                self._folder, kinds, self._effects, self._mounts, with_camera=with_camera
+            )
+            self._stores[key] = self._stack.enter_context(opened)
+        return self._stores[key]
 
     def _rows(self, heliostat: str) -> list[MeasurementRow]:
         return self._store().photographs(self._known(heliostat))[0]

@@ -1,13 +1,27 @@
 """What the library returns: surfaces, fluxes, photographs, comparisons and studies."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from model.images import FLUX_WINDOW
+from service.drawing.facets import FacetPlaces
+from service.drawing.pictures import draw_map, mirror_heights
+
 Array = NDArray[np.float64]
+
+
+def new_axes(ax: Axes | None) -> Axes:
+    """``ax``, or the axes of a new figure of pyplot."""
+    from matplotlib import pyplot  # its import chooses a backend
+
+    return pyplot.figure(layout="constrained").subplots() if ax is None else ax
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +51,34 @@ class Surface:
 
     heliostat: str
     source: Literal["ideal", "measured", "network", "refined", "given"]
-    z: Array
-    control_points: Array
+    z: Array = field(repr=False)
+    control_points: Array = field(repr=False)
     degree: int = 3
-    z_std: Array | None = None
+    z_std: Array | None = field(default=None, repr=False)
     images: tuple[str, ...] = ()
     misfit: float | None = None
     warnings: tuple[str, ...] = ()
+
+    def plot(self, bound_mm: float = 2.0, ax: Axes | None = None) -> Axes:
+        """Draw the heights over the ideal facets [mm], seen from the front.
+
+        Parameters
+        ----------
+        bound_mm : float [mm]
+            End of the colour scale on both sides.
+        ax : matplotlib.axes.Axes, optional
+            By default those of a new figure.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        axes, places = new_axes(ax), FacetPlaces.of_control_points(self.control_points)
+        (width, height), heights = np.ptp(places.box, axis=0).tolist(), mirror_heights(self.z)
+        bounds, size = (-bound_mm, bound_mm), (width, height)
+        draw_map(axes, places.image(heights), size, "RdBu_r", bounds, "height [mm]", places)
+        axes.set_title(f"{self.heliostat}, {self.source}")
+        return axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +102,19 @@ class Flux:
         Azimuth from north over east, and elevation.
     """
 
-    flux: NDArray[np.float32]
+    flux: NDArray[np.float32] = field(repr=False)
     size_m: tuple[float, float]
     peak_w_m2: float
     power_w: float
-    center_of_mass_m: Array | None
-    camera_view: NDArray[np.float32] | None
+    center_of_mass_m: Array | None = field(repr=False)
+    camera_view: NDArray[np.float32] | None = field(repr=False)
     sun_deg: tuple[float, float]
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the map [kW/m2] into ``ax``, by default of a new figure; return the axes."""
+        axes = new_axes(ax)
+        draw_map(axes, self.flux / 1e3, self.size_m, "inferno", (0.0, None), "flux [kW/m2]")
+        return axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +137,19 @@ class Photograph:
     target: str
     sun_deg: tuple[float, float]
     taken_at: datetime | None
-    flux: NDArray[np.float32] | None
-    centered: NDArray[np.float32]
+    flux: NDArray[np.float32] | None = field(repr=False)
+    centered: NDArray[np.float32] = field(repr=False)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the flux about its centre into ``ax``, by default of a new figure; return the
+        axes.
+        """
+        axes = new_axes(ax)
+        draw_map(
+            axes, self.centered, (FLUX_WINDOW,) * 2, "inferno", (0.0, None), "flux [% per pixel]"
+        )
+        axes.set_title("{}: sun {:.0f}°, {:.0f}°".format(self.identifier, *self.sun_deg))
+        return axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +170,7 @@ class Comparison:
     """
 
     photograph: Photograph
-    forecast: NDArray[np.float32]
+    forecast: NDArray[np.float32] = field(repr=False)
     accuracy: float
     window_m: float
     is_held_out: bool
@@ -144,7 +196,31 @@ class StudyResult:
 
     verdict: Literal["effect", "none", "unexplained"]
     conclusion: str
-    effects: list[dict[str, Any]]
+    effects: list[dict[str, Any]] = field(repr=False)
     accuracy_before: float
     accuracy_after: float
-    report: dict[str, Any]
+    report: dict[str, Any] = field(repr=False)
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """The parameters of the effects as a table: value, and interval of 95 %."""
+        rows = [
+            (effect["name"], name, found["value"], *(found["ci95"] or (np.nan, np.nan)))
+            for effect in self.effects
+            for name, found in effect["parameters"].items()
+        ]
+        return pd.DataFrame(rows, columns=["effect", "parameter", "value", "low", "high"])
+
+
+def to_frame(items: Iterable[Photograph | Comparison | Surface | Flux]) -> pd.DataFrame:
+    """Results as a table of pandas, one row each, without their arrays.
+
+    A comparison has the columns of its photograph, too.
+
+    Examples
+    --------
+    >>> heliotwin.to_frame(plant.compare(surface)).groupby("is_held_out").accuracy.mean()
+    """
+    rows = (vars(getattr(one, "photograph", one)) | vars(one) for one in items)
+    wide = (np.ndarray, Photograph)
+    return pd.DataFrame([{k: v for k, v in r.items() if not isinstance(v, wide)} for r in rows])

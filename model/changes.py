@@ -37,7 +37,7 @@ _NORMAL95 = 1.96
 
 
 @dataclass(frozen=True)
-class Change:
+class LevelChange:
     """A change of the level of a series.
 
     Attributes
@@ -76,7 +76,7 @@ class Change:
 
 def find_changes(
     times: Sequence[datetime], values: Sequence[float], sigma: float | None = None
-) -> list[Change]:
+) -> list[LevelChange]:
     """Find the changes of a series that are at least `CERTAIN`, in order of time.
 
     ``times`` (n,) are in ascending order, of ``values`` (n,) whose noise has the standard deviation
@@ -109,7 +109,7 @@ def find_changes(
         (before, of_before), (after, of_after) = best.level(begin, place), best.level(place, end)
         error = float(np.hypot(of_before, of_after))
         since, until = times[held.min() - 1], times[held.max()]
-        found.append(Change(since, until, skipped + place, sure, before, after, error))
+        found.append(LevelChange(since, until, skipped + place, sure, before, after, error))
     return found
 
 

@@ -92,10 +92,14 @@ neighbours 0.3.
 
 @dataclass(frozen=True)
 class SunContradiction:
-    """Angle [deg] between a recorded sun and that of its recorded time, with the likely cause."""
+    """Angle [deg] between a recorded sun and that of its recorded time, with the likely cause.
+
+    ``ahead_h`` [h] is how far a clock that explains it is ahead, if there is one.
+    """
 
     angle_deg: float
     detail: str
+    ahead_h: float | None = None
 
 
 def clock_faults(
@@ -150,6 +154,5 @@ def _likely_fault(
     if hours == 0 or apart.min() > TOLERANCE_DEG:
         return SunContradiction(apart_deg, f"{said}; check time, sun and place")
     direction = "ahead" if hours > 0 else "behind"
-    return SunContradiction(
-        apart_deg, f"{said}; a clock {abs(hours):g} h {direction} explains it: check its time zone"
-    )
+    detail = f"{said}; a clock {abs(hours):g} h {direction} explains it: check its time zone"
+    return SunContradiction(apart_deg, detail, hours)

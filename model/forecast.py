@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -240,7 +240,9 @@ class Aligned:
         def image_part(
             group: AlignedGroup, window: Window, there: Sequence[Effect], places: list[int]
         ) -> Tensor:
-            return apply_image_effects(there, flux[[group.rows[place] for place in places]], window)
+            rows = [group.rows[place] for place in places]
+            setups = [group.setups[place] for place in places]
+            return apply_image_effects(there, flux[rows], window, setups, self.model.site)
 
         effects = effects_of_stage(self.model.effects, "image")
         return self.trace_parts((view or View()).windows_on, effects, image_part)
@@ -267,7 +269,9 @@ class Aligned:
             flux = view.trace(
                 group.scene.subset(places), window, apply_optics_effects(there, self.model.optics)
             )
-            return _flux_image(flux, window, there, size, side)
+            setups = [group.setups[place] for place in places]
+            shown = _CameraView(window, there, setups, self.model.site)
+            return _flux_image(flux, shown, size, side)
 
         return self.trace_parts(_flux_windows(self.model.effects, size, side), effects, image_part)
 
@@ -333,7 +337,9 @@ def flux_changes(
         )
         changes = heights.combine(by_shape)
         images = flux + torch.cat([torch.zeros_like(flux)[None], changes])
-        seen = _flux_image(images.flatten(0, 1), window, there, size, side)
+        setups = [group.setups[place] for place in places] * len(images)
+        shown = _CameraView(window, there, setups, model.site)
+        seen = _flux_image(images.flatten(0, 1), shown, size, side)
         return seen.view(-1, len(places), size, size).transpose(0, 1)
 
     effects = effects_of_stage(model.effects, "optics", "image")
@@ -362,15 +368,22 @@ def _flux_windows(
     ]
 
 
-def _flux_image(
-    flux: Tensor, window: Window, effects: Sequence[Effect], size: int, side: float
-) -> Tensor:
+class _CameraView(NamedTuple):
+    """A window on the targets of B setups, and the effects of the cameras that look at it."""
+
+    window: Window
+    effects: Sequence[Effect]
+    setups: Sequence[Setup]
+    site: Site
+
+
+def _flux_image(flux: Tensor, shown: _CameraView, size: int, side: float) -> Tensor:
     """Flux images (B, size, size), sum 100, of ``flux`` (B, rows, columns), by the cameras."""
+    window, effects, setups, site = shown
     if window.on_spot:
         return normalized(flux)
-    return normalized(
-        crop_to_spots(apply_image_effects(effects, flux, window).clamp(min=0), window, size, side)
-    )
+    images = apply_image_effects(effects, flux, window, setups, site).clamp(min=0)
+    return normalized(crop_to_spots(images, window, size, side))
 
 
 # --- alignment
@@ -434,7 +447,7 @@ def _align_group(
 
     def alter(scene: Scene) -> Scene:
         for effect in effects:
-            scene = effect.on_scene(scene, heliostats)
+            scene = effect.on_setups(scene, true, site)
         return scene
 
     by_motors = _angles_by_motors(setups, true)

@@ -40,7 +40,7 @@ class Bounds(NamedTuple):
     high: Array
 
 
-class Problem(Protocol[State]):
+class MinimizationProblem(Protocol[State]):
     """A cost to minimize, as a function of states, which may hold more than P numbers."""
 
     def cost(self, state: State) -> float:
@@ -101,7 +101,10 @@ class Minimum(Generic[State]):
 
 
 def minimize(
-    problem: Problem[State], state: State, options: MinimizerOptions, jacobian: Array | None = None
+    problem: MinimizationProblem[State],
+    state: State,
+    options: MinimizerOptions,
+    jacobian: Array | None = None,
 ) -> Minimum[State]:
     """Find the local minimum downhill of a state of finite cost.
 

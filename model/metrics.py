@@ -73,13 +73,15 @@ def compare_on_target(
     size: tuple[float, float],
     window: float = FLUX_WINDOW,
     resolution: int = FLUX_SIZE,
+    measured_size: tuple[float, float] | None = None,
 ) -> FluxComparison:
     """Compare two fluxes (rows, columns) over one target of ``size`` (width, height) [m].
 
     Each is cut to a square ``window`` [m] about its own centre of mass, (resolution, resolution)
-    pixels.
+    pixels. ``measured_size`` [m] is that of the first if it shows only a part of the target.
     """
-    first, second = (_cut(flux, size, window, resolution) for flux in (measured, forecast))
+    first = _cut(measured, measured_size or size, window, resolution)
+    second = _cut(forecast, size, window, resolution)
     accuracy = flux_accuracy(first.flux, second.flux)
     return FluxComparison(accuracy, window, first.outside, second.outside)
 

@@ -18,6 +18,13 @@ BLACK = 0.01
 """Flux [of the peak] up to which noise that is truncated at black brightens pixels."""
 
 
+def size_nuisance(images: Tensor) -> Tensor:
+    """Change (..., R, R) of images (..., R, R) per relative change of their size [1], sum kept."""
+    place = (torch.arange(images.shape[-1]) + 0.5).to(images) - images.shape[-1] / 2
+    up, right = torch.gradient(images, dim=(-2, -1))
+    return -(place[:, None] * up + place * right + 2 * images)
+
+
 def nuisances(images: Tensor, side: float = FLUX_WINDOW) -> Tensor:
     """Changes (..., 7, R, R) of images (..., R, R) of ``side`` [m] by one standard deviation."""
     pixel, peak = side / images.shape[-1], images.amax(dim=(-2, -1), keepdim=True)

@@ -52,6 +52,8 @@ class Observation:
         None if it is not known.
     side : float [m]
         Of the square.
+    size_error : float [1]
+        Relative standard deviation of ``side``, if it is not known exactly.
     """
 
     flux: NDArray[np.float32]
@@ -63,6 +65,7 @@ class Observation:
     clipped: NDArray[np.float32] | None = None
     taken_at: datetime | None = None
     side: float = FLUX_WINDOW
+    size_error: float = 0.0
 
     @property
     def clipped_share(self) -> float:
@@ -111,6 +114,9 @@ class SurfacePrediction:
         Identifiers of images that were excluded because the others contradict them.
     warnings : tuple of str
         Further reasons not to trust it, in sentences (`model.prediction_warnings`).
+    is_start_better : bool
+        Whether the surface that a refinement started from agrees better with each image than the
+        surface that is refined from the others.
     """
 
     z: NDArray[np.float64]
@@ -124,6 +130,7 @@ class SurfacePrediction:
     mahalanobis_distance: float = 1.0
     contradicting: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    is_start_better: bool = False
 
     @property
     def misfit(self) -> float:

@@ -99,8 +99,8 @@ def canting_warnings(prior: SurfacePrior, z: Array) -> list[str]:
     mean, std = _usual_canting(prior)
     distances = np.linalg.norm((_relative_canting(z) - mean) / std, axis=-1)
     return [
-        f"facet {number} is canted {distance:.1f} standard deviations off; {MAX_CANTING} are usual"
-        " at most"
+        f"facet {number} is canted {distance:.2f} standard deviations off; known mirrors are within"
+        f" {MAX_CANTING:.2f}"
         for number, distance in enumerate(distances, start=1)
         if distance > MAX_CANTING
     ]

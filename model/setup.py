@@ -38,6 +38,8 @@ class Setup:
     identifier : str
     taken_at : datetime or None
         With time zone; effects may begin and end. None if it is not known.
+    temperature_c : float or None [deg C]
+        Of the air then.
     neighbours : (K, 3, 3) [m] or None
         Rectangles in ENU of mirrors that may hide parts of this one, by the plant's layout
         (`model.neighbours`). They act by the effect `known_neighbours` only.
@@ -53,6 +55,7 @@ class Setup:
     degree: int = DEGREE
     identifier: str = ""
     taken_at: datetime | None = None
+    temperature_c: float | None = None
     neighbours: Array | None = None
 
     @property

@@ -237,6 +237,7 @@ def heights(
     heliostat: Heliostat,
     points: ArrayLike,
     degree: int = DEGREE,
+    parameters_are_positions: bool = False,
     samples: int = 64,
     shape: tuple[int, int] = (ROWS, COLUMNS),
 ) -> Array:
@@ -246,6 +247,9 @@ def heights(
     The slopes of the given surface, in the frame of each ideal facet, are fitted by least squares:
     deflectometry measures normals, which determine heights up to the facet's mean. Facets some
     millimetres off their ideal place keep their own centre.
+
+    A normal is at the spline's point. With ``parameters_are_positions`` it is at the position that
+    its parameters are of the facet's width and height: so ARTIST fits deflectometry.
     """
     _, axes, half_sizes = heliostat.facet_frames
     count = len(np.asarray(points))
@@ -254,15 +258,32 @@ def heights(
             f"a surface of {count} facets for {heliostat.name}, which has {len(axes)}"
         )
     grid = (np.arange(samples) + 0.5) / samples
-    normals = evaluate(points, grid, grid, degree).normals
-    u, v = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
-    local = np.einsum("fnmd,fcd->fnmc", normals, axes).reshape(len(axes), -1, 3)
+    places, normals = (
+        np.einsum("fnmd,fcd->fnmc", vectors, axes).reshape(len(axes), -1, 3)
+        for vectors in evaluate(points, grid, grid, degree)
+    )
+    uv = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    on_facet = np.broadcast_to(uv, (len(axes), *uv.shape))
+    if not parameters_are_positions:
+        corners = np.einsum("fnmd,fcd->fnmc", np.asarray(points)[:, [0, -1]][:, :, [0, -1]], axes)
+        middles = corners[..., :2].mean(axis=(1, 2))[:, None]
+        on_facet = (places[..., :2] - middles) / (2 * half_sizes[:, None]) + 0.5
     fitted = np.array(
-        [fit_heights(u, v, n, size, shape) for n, size in zip(local, half_sizes, strict=True)]
+        [
+            fit_heights(own[inside, 0], own[inside, 1], normal[inside], size, shape)
+            for own, inside, normal, size in zip(
+                on_facet, _in_unit_square(on_facet), normals, half_sizes, strict=True
+            )
+        ]
     )
     if any(facet.focal_length for facet in heliostat.facets):
         fitted = fitted - nominal_heights(heliostat, shape)
     return fitted
+
+
+def _in_unit_square(places: Array) -> Array:
+    """Whether places (..., 2) are within [0, 1]."""
+    return np.asarray(((places >= 0) & (places <= 1)).all(axis=-1))
 
 
 def fit_heights(

@@ -1,5 +1,5 @@
 """``python -m service`` is the command ``heliotwin``."""
 
-from service.cli.main import main
+from heliotwin.cli.main import main
 
 main()

@@ -123,16 +123,15 @@ def texts() -> Iterator[str]:
 
 
 def repeated_classes() -> dict[str, list[str]]:
-    """Names of classes that occur more than once in a package."""
-    places: dict[tuple[str, str], list[str]] = {}
+    """Names of classes that occur more than once in the product."""
+    places: dict[str, list[str]] = {}
     for definition in definitions():
         if isinstance(definition.node, ast.ClassDef):
-            package = definition.path.partition("/")[0]
-            places.setdefault((package, definition.node.name), []).append(definition.place)
-    return {name: found for (_, name), found in places.items() if len(found) > 1}
+            places.setdefault(definition.node.name, []).append(definition.place)
+    return {name: found for name, found in places.items() if len(found) > 1}
 
 
-REQUEST_CLASSES = ("ForecastIn", "ForecastRequest", "Setup")
+REQUEST_CLASSES = ("ReceiverChoice", "ForecastIn", "Setup")
 """What a forecast request is on its way from the REST schema to the tracer."""
 
 
@@ -182,7 +181,7 @@ def lines_with(word: str) -> int:
 def _functions() -> Iterator[Definition]:
     for definition in definitions():
         is_endpoint = definition.path.startswith(
-            ("service/cli/verbs/", "service/web/api/", "service/web/pages/")
+            ("heliotwin/cli/verbs/", "service/web/api/", "service/web/pages/")
         )
         if not isinstance(definition.node, ast.ClassDef) and not (
             is_endpoint and definition.node.decorator_list
@@ -207,15 +206,15 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 51_215,
+    "lines of code": 54_381,
     "words that WORDS.md replaces": 0,
-    "names of two or more classes": 0,
+    "names of two or more classes": 3,
     f"functions above {MAX_PARAMETERS} parameters": 0,
-    "functions that return a bare tuple": 43,
+    "functions that return a bare tuple": 42,
     f"classes above {MAX_CLASS_LINES} lines": 1,
-    "lines with latitude_deg": 19,
-    "names of a forecast request's fields": 22,
-    "dict[str, Any] in service": 64,
+    "lines with latitude_deg": 17,
+    "names of a forecast request's fields": 23,
+    "dict[str, Any] in service": 39,
 }
 """The most of each count. A limit is lowered when its count falls; it rises with a feature only."""
 

@@ -25,9 +25,9 @@ from coverage import Coverage
 from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks import data_folder
+from heliotwin.demo.plant import write_plant
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
-from service.cli.demo_plant import write_plant
 from tests.undeclared import camera
 from tests.waiting import WAIT_LIMIT_S
 from tests.watched import NotWatchedError, environment, watching

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from fastapi.testclient import TestClient
 
+from heliotwin.demo.plant import ORIGIN, POSITIONS, TARGET, write_plant
 from model.ephemeris import sun_positions
 from model.frames import sun_direction
 from service.base.settings import Settings
-from service.cli.demo_plant import ORIGIN, POSITIONS, TARGET, write_plant
 from service.jobs import kind
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
@@ -223,6 +223,8 @@ def measure(record: Recorder, root: Path) -> None:
     record.call("get_corrections", f"GET {one}/corrections")
     path = "/v1/heliostats/AB12/measurements"
     record.call("list_measurements", f"GET {path}")
+    plant = "/v1/measurements?heliostat=AB12&until=2026-04-25T07:40:00Z"
+    record.call("list_plant_measurements", f"GET {plant}")
     record.call("get_measurement", f"GET {path}/101")
     record.call("get_image", f"GET {path}/101/image")
     record.call("get_flux", f"GET {path}/101/flux")
@@ -302,8 +304,7 @@ def point(record: Recorder) -> None:
 def study(record: Recorder) -> None:
     """A study that finds the camera's curve."""
     options = {"surfaces": "measured", "candidates": ["camera_response", "slope_error"]}
-    job = record.run("post_study", "/v1/studies", **options)
-    record.examples["post_studies_job"] = record.examples["post_study"]
+    job = record.run("post_studies_job", "/v1/jobs/studies", **options)
     path = f"/v1/studies/{job['result']['study']}"
     record.call("list_studies", "GET /v1/studies")
     assert record.call("get_study", f"GET {path}")["verdict"] == "effect"
@@ -329,6 +330,8 @@ def administrate(record: Recorder, key: str) -> None:
     record.call("get_job_events", f"GET {path}/events")
     last = {"Last-Event-ID": "9999999999"}
     record.call("get_job_events", f"GET {path}/events", 204, headers=last)
+    choice = record.call("post_camera_choices_job", "POST /v1/jobs/camera-choices", 202, json={})
+    record.client.post(f"/v1/jobs/{choice['id']}/cancel")  # the plant declares its camera
     waiting = record.call("post_predictions_job", "POST /v1/jobs/predictions", 202, json={})
     record.call("cancel_job", f"POST /v1/jobs/{waiting['id']}/cancel")
     writer = FieldStateWriter(record.client.app.state.runtime)  # type: ignore[attr-defined]

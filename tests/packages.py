@@ -20,11 +20,10 @@ PACKAGES = (
         "model.effects",
         "model.study",
     ),
-    *(
-        f"service.{name}"
-        for name in ("base", "drawing", "sources", "store", "twin", "jobs", "web", "cli")
-    ),
+    *(f"service.{name}" for name in ("base", "drawing", "sources", "store", "twin", "jobs", "web")),
     "training",
+    "heliotwin",
+    "heliotwin.cli",
 )
 """The packages of the table, in the order in which they build on each other."""
 
@@ -40,7 +39,7 @@ def package_imports() -> dict[str, list[str]]:
 
     Imports from another top-level package are listed under its name, for example ``model``.
     """
-    graph = grimp.build_graph("model", "training", "service", cache_dir=None)
+    graph = grimp.build_graph("model", "training", "service", "heliotwin", cache_dir=None)
     found: dict[str, list[str]] = {}
     for package in PACKAGES:
         inside = {package, *graph.find_descendants(package)}
@@ -57,7 +56,7 @@ def package_imports() -> dict[str, list[str]]:
         ]
         far = [
             name
-            for name in ("model", "service", "training")
+            for name in ("model", "service", "training", "heliotwin")
             if name != owner and any(_is_in(i, name) for i in imported)
         ]
         found[package] = [*far, *(other.removeprefix(f"{owner}.") for other in near)]

@@ -24,7 +24,7 @@ FILES = {
     "REST resource": "service/web/api/greetings.py",
     "job kind": "service/jobs/kinds/doublings.py",
     "page": "service/web/pages/hello.py",
-    "CLI verb": "service/cli/verbs/greet.py",
+    "CLI verb": "heliotwin/cli/verbs/greet.py",
     "importer": "service/sources/importers/notes.py",
     "export format": "service/web/responses/representations/table.py",
     "effect": "model/effects/dust_glow.py",
@@ -45,7 +45,7 @@ LINES = {
 def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What came of each addition: "ok", or how it failed."""
     root = tmp_path_factory.mktemp("additions")
-    for package in ("model", "service", "training", "migrations"):
+    for package in ("model", "service", "training", "migrations", "heliotwin"):
         shutil.copytree(
             ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__")
         )

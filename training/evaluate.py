@@ -45,7 +45,7 @@ DISTANCES = (0, 75, 125, 200, 300)
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class NetworkEvaluation:
     """All results, by method; the series hold median errors [mm].
 
     ``over_distance`` has a value for each bin of `DISTANCES`. ``over_inputs`` has a value for 1 to
@@ -139,7 +139,7 @@ def _series_table(name: str, steps: Sequence[str], series: dict[str, list[float]
 
 def evaluate(
     methods: dict[str, Method], cases: list[Case], few: int, fewest: int = 1
-) -> Evaluation:
+) -> NetworkEvaluation:
     """Evaluate all methods on all cases; the ideal surface must be the first method.
 
     Refinement, and fewer images, are evaluated on the first ``few`` cases. Numbers of images below
@@ -155,7 +155,7 @@ def evaluate(
             for images in range(1, MAX_IMAGES)
         ]
         inputs[name] = [*fewer, float(np.median([o.mae_mm for o in outcomes[name][:few]]))]
-    return Evaluation(outcomes, inputs, few)
+    return NetworkEvaluation(outcomes, inputs, few)
 
 
 def compared(network: Path, beside: Path | None, mean: Array) -> dict[str, Method]:
@@ -174,7 +174,9 @@ def compared(network: Path, beside: Path | None, mean: Array) -> dict[str, Metho
     }
 
 
-def draw(evaluation: Evaluation, methods: dict[str, Method], cases: list[Case], out: Path) -> None:
+def draw(
+    evaluation: NetworkEvaluation, methods: dict[str, Method], cases: list[Case], out: Path
+) -> None:
     """Plot errors over distance and over images, and surfaces of three cases.
 
     These are the best, the median and the worst case of the refinement.

@@ -70,7 +70,7 @@ def median_error(method: Method, cases: Sequence[Case], images: int) -> float:
     )
 
 
-class Interval(NamedTuple):
+class BootstrapInterval(NamedTuple):
     """Ends of a 90 % interval."""
 
     low: float
@@ -88,13 +88,13 @@ class Figures:
 
     cases: int
     mae_mm: dict[str, float]
-    median_90: Interval
+    median_90: BootstrapInterval
     flux_accuracy: float
     flux_accuracy_median: float
     flux_accuracy_elsewhere: float
     worse_than_ideal: float
     covered: float | None
-    covered_90: Interval | None
+    covered_90: BootstrapInterval | None
 
     @classmethod
     def of(cls, outcomes: Sequence[Outcome], ideal: Sequence[Outcome]) -> "Figures":
@@ -132,26 +132,26 @@ class Figures:
 
 def _over_mirrors(
     statistic: Callable[[Array], Any], values: Array, outcomes: Sequence[Outcome]
-) -> Interval:
+) -> BootstrapInterval:
     """`interval` of a statistic of the outcomes' values (N,)."""
     mirrors = np.array([o.surface for o in outcomes])
     groups = [values[mirrors == mirror] for mirror in np.unique(mirrors)]
     ends = interval(
         lambda drawn: float(statistic(np.concatenate([groups[i] for i in drawn]))), len(groups)
     )
-    return Interval(round(ends.low, 4), round(ends.high, 4))
+    return BootstrapInterval(round(ends.low, 4), round(ends.high, 4))
 
 
 def interval(
     statistic: Callable[[NDArray[np.int64]], float], mirrors: int, draws: int = 2000
-) -> Interval:
+) -> BootstrapInterval:
     """90 % bootstrap interval of a ``statistic`` over mirrors.
 
     The ``statistic`` takes indices of mirrors (mirrors,), which each draw samples again.
     """
     every = np.arange(mirrors)
     if mirrors < 2:  # one mirror cannot be resampled
-        return Interval(statistic(every), statistic(every))
+        return BootstrapInterval(statistic(every), statistic(every))
     drawn = bootstrap(
         (every,),
         statistic,
@@ -161,7 +161,7 @@ def interval(
         method="percentile",
         rng=0,
     )
-    return Interval(*map(float, drawn.confidence_interval))
+    return BootstrapInterval(*map(float, drawn.confidence_interval))
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -170,7 +170,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def shown(value: float | None, form: str = ".3f", between: Interval | None = None) -> str:
+def shown(value: float | None, form: str = ".3f", between: BootstrapInterval | None = None) -> str:
     """Format a number for a table, with its interval if given; empty if it is unknown."""
     if value is None or np.isnan(value):
         return ""

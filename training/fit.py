@@ -108,14 +108,14 @@ def _rows(vectors: Any) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class MirrorFit:
     """Heights (F, 8, 8) [m] of a mirror, and residual angles (n,) [mrad] of its normals."""
 
     z: Array
     residuals_mrad: Array
 
 
-def fit(measured: Deflectometry) -> Fit:
+def fit(measured: Deflectometry) -> MirrorFit:
     """Fit every facet by least squares."""
     centers, axes, half_sizes = measured.heliostat.facet_frames
     facets = [
@@ -124,10 +124,12 @@ def fit(measured: Deflectometry) -> Fit:
             measured.points, measured.normals, centers, axes, half_sizes, strict=True
         )
     ]
-    return Fit(np.array([f.z for f in facets]), np.concatenate([f.residuals_mrad for f in facets]))
+    return MirrorFit(
+        np.array([f.z for f in facets]), np.concatenate([f.residuals_mrad for f in facets])
+    )
 
 
-def fit_facet(points: Array, normals: Array, half_size: Array) -> Fit:
+def fit_facet(points: Array, normals: Array, half_size: Array) -> MirrorFit:
     """Fit one facet to points (n, 3) [m] and normals (n, 3) in its ideal frame.
 
     Points beyond its edges are not used.
@@ -138,7 +140,7 @@ def fit_facet(points: Array, normals: Array, half_size: Array) -> Fit:
     normals = normals[there] / np.linalg.norm(normals[there], axis=1, keepdims=True)
     z = fit_heights(u, v, normals, half_size)
     apart = np.linalg.norm(normals_of(z, u, v, half_size) - normals, axis=1)
-    return Fit(z, 2e3 * np.arcsin(apart / 2))
+    return MirrorFit(z, 2e3 * np.arcsin(apart / 2))
 
 
 def normals_of(z: Array, u: Array, v: Array, half_size: Array) -> Array:
@@ -185,7 +187,7 @@ HEAD = (
 )
 
 
-def row(measured: Deflectometry, fitted: Fit) -> list[str]:
+def row(measured: Deflectometry, fitted: MirrorFit) -> list[str]:
     """A mirror's row of the table.
 
     Without a finer surface, the loss of accuracy and the ripples are empty.

@@ -15,7 +15,7 @@ from model.plant_model import JUELICH_MODEL
 from model.prior import SurfacePrior
 from model.refinement import refine
 from training.cases import Case
-from training.render import Photographs, Setups
+from training.render import Renderings, Setups
 from training.train import Run
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def by_run(run: Run, n_iterations: int | None = None) -> Method:
                 [nothing if o.clipped is None else o.clipped for o in used],
             )
         )
-        seen = Photographs(Setups.of([case.heliostat], suns, aims, run.device), flux, clipped)
+        seen = Renderings(Setups.of([case.heliostat], suns, aims, run.device), flux, clipped)
         return Heights(run.predict(seen, n_iterations)[0].double().numpy())
 
     return method

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from model.effects import Effect, apply_image_effects, apply_optics_effects
+from model.effects import Effect, apply_optics_effects, in_light_order
 from model.effects.background import Background
 from model.effects.camera_response import CameraResponse
 from model.effects.camera_shoulder import CameraShoulder
@@ -209,7 +209,7 @@ class Setups:
 
 
 @dataclass(frozen=True, eq=False)
-class Photographs:
+class Renderings:
     """Images of B heliostats, with equal numbers.
 
     Attributes
@@ -243,9 +243,9 @@ class Photographs:
 
         return conjugate_gradient_steps(traced, self.flux, basis, self.setups.side)
 
-    def __getitem__(self, rows: slice) -> "Photographs":
+    def __getitem__(self, rows: slice) -> "Renderings":
         """Select some heliostats."""
-        return Photographs(self.setups[rows], self.flux[rows], self.clipped[rows])
+        return Renderings(self.setups[rows], self.flux[rows], self.clipped[rows])
 
 
 class CameraImages(NamedTuple):
@@ -328,7 +328,10 @@ class Camera:
         flux = trace(
             scene, window, apply_optics_effects(effects, Optics()), samples=16, padding=0.25
         ).irradiance
-        return apply_image_effects(effects, flux.clamp(min=0), window)
+        flux = flux.clamp(min=0)
+        for effect in in_light_order(effects):
+            flux = effect.on_image(flux, window)
+        return flux
 
     def _developed(self, images: Tensor, share: float, rng: np.random.Generator) -> Tensor:
         """Convert to counts and back; return linear intensity and saturated pixels (2, B, R, C)."""
@@ -422,7 +425,7 @@ def render(
     camera: Camera | None,
     device: torch.device,
     seed: int,
-) -> Photographs:
+) -> Renderings:
     """Photographs of surfaces ``z`` (B, 4, 8, 8) [m] in random scenes.
 
     Without a camera, the flux is traced for the default sun without further effects.
@@ -431,13 +434,13 @@ def render(
     return take(scenes.setups(field, len(z), images, rng, device), z, camera, rng)
 
 
-def take(setups: Setups, z: Array, camera: Camera | None, rng: np.random.Generator) -> Photographs:
+def take(setups: Setups, z: Array, camera: Camera | None, rng: np.random.Generator) -> Renderings:
     """Photographs of surfaces ``z`` (B, F, 8, 8) [m] with given geometry; see `render`."""
     device = setups.lift.device
     surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)
     if camera is None:
         flux = setups.trace(surfaces, samples=24)
-        return Photographs(setups, flux, torch.zeros_like(flux))
+        return Renderings(setups, flux, torch.zeros_like(flux))
     seen = camera.photograph(setups.scene(surfaces), device, rng, setups.side)
     shape = (len(z), setups.images, FLUX_SIZE, FLUX_SIZE)
-    return Photographs(setups, *(values.view(shape) for values in seen))
+    return Renderings(setups, *(values.view(shape) for values in seen))

@@ -27,7 +27,7 @@ from model.network.architecture import MAX_IMAGES, SurfaceNetwork
 from model.prior import SurfacePrior
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Photographs, load_field, render
+from training.render import Renderings, load_field, render
 from training.surfaces import load_surfaces
 
 Array = NDArray[np.float64]
@@ -85,14 +85,14 @@ def commit_of(folder: Path) -> str:
     return done.stdout.strip() or "unknown"
 
 
-class Batch(NamedTuple):
+class TrainingBatch(NamedTuple):
     """Photographs of mirrors, and their true heights (B, F, 8, 8) [mm]."""
 
-    photographs: Photographs
+    photographs: Renderings
     truth: Tensor
 
     @classmethod
-    def of(cls, seen: Photographs, z: Array) -> "Batch":
+    def of(cls, seen: Renderings, z: Array) -> "TrainingBatch":
         """Photographs of heights ``z`` (B, F, 8, 8) [m]."""
         truth = torch.as_tensor(z * 1e3, dtype=torch.float32, device=seen.flux.device)
         return cls(seen, truth - truth.mean(dim=(2, 3), keepdim=True))
@@ -160,7 +160,7 @@ class Trainer(ABC):
         torch.save(state, self.folder / "checkpoint.tmp")
         (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
 
-    def inputs(self, photographs: Photographs, guess: Tensor) -> tuple[Tensor, ...]:
+    def inputs(self, photographs: Renderings, guess: Tensor) -> tuple[Tensor, ...]:
         """Return the network's inputs for photographs of B mirrors and guesses (B, F, 8, 8) [m]."""
         # Geometry needs more than sixteen bits: all of it is outside of autocast.
         with torch.no_grad():
@@ -170,7 +170,7 @@ class Trainer(ABC):
         return photographs.flux, conditions, mask, guess_flux, guess * 1e3, descent * 1e3
 
     @torch.no_grad()
-    def predict(self, photographs: Photographs, n_iterations: int | None = None) -> Tensor:
+    def predict(self, photographs: Renderings, n_iterations: int | None = None) -> Tensor:
         """Return the surfaces (B, F, 8, 8) [m] of the averaged network after all iterations."""
         guess = self.mean.expand(len(photographs.flux), -1, -1, -1)
         for _ in range(self.config.n_iterations if n_iterations is None else n_iterations):
@@ -178,7 +178,7 @@ class Trainer(ABC):
         return guess
 
     @abstractmethod
-    def batch(self) -> Batch:
+    def batch(self) -> TrainingBatch:
         """Render photographs of the step's mirrors."""
 
     @abstractmethod
@@ -247,7 +247,7 @@ class Trainer(ABC):
         print(json.dumps(line), flush=True)
 
 
-def height_errors(run: Trainer, batch: Batch) -> list[float]:
+def height_errors(run: Trainer, batch: TrainingBatch) -> list[float]:
     """Mean absolute height error [mm] on a batch after each iteration."""
     counts = range(1, run.config.n_iterations + 1)
     guesses = (run.predict(batch.photographs, count) for count in counts)
@@ -272,7 +272,7 @@ class Run(Trainer):
         """Open a run from its folder, on the CPU."""
         return cls(TrainConfig.read(folder / "config.json"), folder, torch.device("cpu"))
 
-    def batch(self) -> Batch:
+    def batch(self) -> TrainingBatch:
         """Render photographs of the step's mirrors."""
         c = self.config
         rng = np.random.default_rng((c.seed, self.step, 0))
@@ -282,7 +282,7 @@ class Run(Trainer):
             seen = render(
                 z, images, self.field, c.scenes, c.camera, self.device, int(rng.integers(2**31))
             )
-        return Batch.of(seen, z)
+        return TrainingBatch.of(seen, z)
 
     def validate(self, repeats: int = 8) -> list[float]:
         """Mean absolute height error [mm] on validation mirrors after each iteration.
@@ -293,7 +293,7 @@ class Run(Trainer):
             return []
         z = self.validation.repeat(repeats, axis=0)
         seen = render(z, MAX_IMAGES, self.field, self.config.scenes, None, self.device, seed=0)
-        return height_errors(self, Batch.of(seen, z))
+        return height_errors(self, TrainingBatch.of(seen, z))
 
 
 def main() -> None:

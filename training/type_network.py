@@ -31,7 +31,7 @@ from model.tracing import Optics
 from training.config import TrainConfig
 from training.export import export_checked
 from training.render import Camera, Setups, draw_suns, take
-from training.train import Batch, Trainer, height_errors
+from training.train import Trainer, TrainingBatch, height_errors
 from training.type_prior import type_prior
 
 Array = NDArray[np.float64]
@@ -149,7 +149,7 @@ class TypeRun(Trainer):
         usual = 1e3 * float(np.abs(drawn - prior.mean).mean())
         super().__init__(config, folder, device, prior, usual, scale=usual)
 
-    def batch(self) -> Batch:
+    def batch(self) -> TrainingBatch:
         """Render photographs of the step's mirrors."""
         c = self.config
         rng = np.random.default_rng((c.seed, self.step, 1))
@@ -160,18 +160,18 @@ class TypeRun(Trainer):
         return height_errors(self, self.validation)
 
     @cached_property
-    def validation(self) -> Batch:
+    def validation(self) -> TrainingBatch:
         """Drawn mirrors with eight clean images."""
         count = min(MAX_VALIDATED, 2 * self.config.batch)
         return self._rendered(count, MAX_IMAGES, None, np.random.default_rng(0))
 
     def _rendered(
         self, count: int, images: int, camera: Camera | None, rng: np.random.Generator
-    ) -> Batch:
+    ) -> TrainingBatch:
         z = draw_surfaces(self.scenes.prior, count, rng)
         with torch.no_grad():
             setups = self.scenes.draw(count, images, rng)
-            return Batch.of(take(setups, z, camera, rng), z)
+            return TrainingBatch.of(take(setups, z, camera, rng), z)
 
 
 def write_network(run: TypeRun, out: Path) -> dict[str, Any]:

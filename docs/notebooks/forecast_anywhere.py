@@ -36,6 +36,7 @@ surfaces = [plant.predict(name) for name in plant.heliostats]
 # %%
 flux = plant.forecast(surfaces[0], on="calibration_target", sun=(200.0, 45.0))
 print(f"peak {flux.peak_w_m2:.0f} W/m2, power {flux.power_w:.0f} W")
+flux.plot()
 
 # %% [markdown]
 # ## On any plane, at a time
@@ -50,11 +51,8 @@ maps = [plant.forecast(surface, on=board, sun=noon, resolution=(128, 128)) for s
 
 fig, axes = plt.subplots(1, len(maps), figsize=(12, 3.2), layout="constrained")
 for ax, surface, one in zip(axes, surfaces, maps, strict=True):
-    picture = ax.imshow(one.flux / 1e3, extent=(-3, 3, -3, 3), cmap="inferno", vmin=0)
+    one.plot(ax=ax)
     ax.set_title(surface.heliostat)
-    ax.set_xlabel("right [m]")
-axes[0].set_ylabel("up [m]")
-fig.colorbar(picture, ax=axes, label="flux [kW/m2]")
 
 # %% [markdown]
 # Fluxes add. This sum does not include that mirrors shade and block each other;

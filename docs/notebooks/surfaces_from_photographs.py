@@ -27,7 +27,8 @@ import numpy as np
 import heliotwin
 
 plant = heliotwin.make_demo("out/demo/plant")
-print(plant.heliostats, plant.targets)
+print(plant)
+plant.plot()
 
 # %% [markdown]
 # ## Photographs
@@ -37,14 +38,11 @@ print(plant.heliostats, plant.targets)
 
 # %%
 name = "AB12"
+plant = heliotwin.open_plant("out/demo/plant", [name])  # measures the photographs of one only
 photographs = plant.photographs(name)
 fig, axes = plt.subplots(1, 4, figsize=(12, 3.2), layout="constrained")
 for ax, photograph in zip(axes, photographs[:4], strict=True):
-    ax.imshow(photograph.centered, extent=(-2, 2, -2, 2), cmap="inferno")
-    azimuth, elevation = photograph.sun_deg
-    ax.set_title(f"{photograph.identifier}: sun {azimuth:.0f}°, {elevation:.0f}°")
-    ax.set_xlabel("right of the spot's centre [m]")
-axes[0].set_ylabel("up [m]")
+    photograph.plot(ax=ax)
 
 # %% [markdown]
 # ## Surfaces
@@ -65,22 +63,10 @@ surfaces = {
 # A surface is a map of control heights of each facet, over the ideally canted facet. The measured
 # surface is the one that the photographs were made with.
 
-
 # %%
-def mirror_map(z):
-    """Heights (16, 16) of four facets (4, 8, 8), as seen from the front: x to the right, y up."""
-    upper_left, upper_right, lower_left, lower_right = (facet.T[::-1] for facet in z)
-    return np.block([[upper_left, upper_right], [lower_left, lower_right]])
-
-
 fig, axes = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
 for ax, kind in zip(axes, ("network", "refined", "measured"), strict=True):
-    heights_mm = 1e3 * mirror_map(surfaces[kind].z)
-    picture = ax.imshow(heights_mm, cmap="RdBu", vmin=-2, vmax=2, extent=(-1.6, 1.6, -1.3, 1.3))
-    ax.set_title(kind)
-    ax.set_xlabel("x [m]")
-axes[0].set_ylabel("y [m]")
-fig.colorbar(picture, ax=axes, label="height [mm]")
+    surfaces[kind].plot(ax=ax)
 
 # %% [markdown]
 # ## Are they right?
@@ -93,6 +79,6 @@ fig.colorbar(picture, ax=axes, label="height [mm]")
 errors_mm, accuracies = {}, {}
 for kind, surface in surfaces.items():
     errors_mm[kind] = 1e3 * np.abs(surface.z - surfaces["measured"].z).mean()
-    held_out = [one for one in plant.compare(surface) if one.photograph.identifier not in used]
-    accuracies[kind] = np.mean([one.accuracy for one in held_out])
+    table = heliotwin.to_frame(plant.compare(surface))
+    accuracies[kind] = table[~table.identifier.isin(used)].accuracy.mean()
     print(f"{kind:>9}: error {errors_mm[kind]:.3f} mm, accuracy {accuracies[kind]:.3f}")

@@ -10,7 +10,7 @@ from alembic import op
 from service.store import job_tables, tables  # noqa: F401 - the metadata knows what was loaded
 from service.store.columns import Base
 
-revision = "50842f195ef7"
+revision = "ccf8878391bd"
 down_revision = None
 branch_labels = None
 depends_on = None

@@ -34,8 +34,10 @@ DRAWS = 200
 WITHIN = 0.95
 """Share of draws that must be within the limit."""
 
-_N_ANEW, _N_AGAIN, _N_FINE = 100, 20, 6
-"""Steps on a quarter of the pixels, from the beginning or from aims that were good, and on all."""
+_N_ANEW, _N_SMALL, _N_AGAIN, _N_FINE = 60, 100, 20, 6
+"""Steps on a quarter of the pixels, from the beginning (of a small field times `_ease`) or from
+aims that were good, and on all.
+"""
 
 _STEPS_FIT = 2000
 """Heliostats for which these steps suffice; fewer ones each matter more, and cost less a step."""
@@ -51,7 +53,7 @@ _UPDATE, _UPDATE_FINE = 10, 6
 _STEP, _STEP_AGAIN, _STEP_FINE, _LAST_STEP = 0.35, 0.06, 0.03, 0.05
 """First step of the aims, relative to the images' spread, and the last relative to the first."""
 
-_TOLERANCE = 0.003
+_TOLERANCE = 0.005
 """Share of the limit by which steps aim below it."""
 
 _DEFOCUS_ABOVE = 0.01
@@ -75,7 +77,7 @@ class Draws(NamedTuple):
     @property
     def ratio(self) -> float:
         """Quantile `WITHIN` of the largest ratio of flux and limit; 1 is just within it."""
-        return float(np.quantile(self.ratios, WITHIN))
+        return _quantile(self.ratios)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +172,8 @@ def plan_aims(
         raise InvalidInputError("limit: must be positive everywhere; give the pixels a small one")
     if start is None:
         plan = _within_budget(replace(single_aim(kernels, limit), moved=_spread_out(kernels)))
-        step, count = _STEP, _N_ANEW * _ease(kernels)
+        ease = _ease(kernels)
+        step, count = _STEP, _N_ANEW if ease == 1 else _N_SMALL * ease
     else:
         plan, step, count = replace(start, kernels=kernels, limit=limit), _STEP_AGAIN, _N_AGAIN
     thin = kernels.thinned()
@@ -178,17 +181,20 @@ def plan_aims(
     rough.run(count, _UPDATE, count // 4 if start is None else 0)
     plan = replace(plan, moved=rough.moved, multipliers=rough.multipliers[thin.block])
     deviations, before = rough.deviations, math.inf
-    second_order = _second_order(_on_blocks(plan, thin))
-    del rough, thin  # the memory of a quarter of the pixels
+    blocks = _on_blocks(plan, thin)
+    linear = linear_draws(blocks)
+    second_order = _quantile(_traced(blocks, linear, linear.ratios, _FULL_DRAWS)) - linear.ratio
+    del blocks, rough, thin  # the memory of a quarter of the pixels
     for _ in range(_CORRECTIONS):
         ascent = _Ascent(plan, _STEP_FINE, between, deviations, second_order)
         ascent.run(_N_FINE * min(_ease(kernels), _MOST_FINE), _UPDATE_FINE)
         plan, deviations = ascent.plan, ascent.deviations
         linear = linear_draws(plan)
-        second_order = _second_order(plan, linear)
-        if linear.ratio + second_order <= 1:
-            second_order = _second_order(plan, linear, _CONFIRMING_DRAWS)
-        excess = linear.ratio + second_order - 1
+        traced = _traced(plan, linear, linear.ratios, _FULL_DRAWS)
+        if _quantile(traced) <= 1:
+            traced = _traced(plan, linear, traced, _CONFIRMING_DRAWS, _FULL_DRAWS)
+        second_order = _quantile(traced) - linear.ratio
+        excess = _quantile(traced) - 1
         if excess <= 0:
             break
         if excess > max(_DEFOCUS_ABOVE, before / 2):
@@ -209,16 +215,18 @@ def _on_blocks(plan: AimPlan, thin: Thinned) -> AimPlan:
     return replace(plan, kernels=thin.kernels, limit=limit, multipliers=multipliers)
 
 
-def _second_order(
-    plan: AimPlan, linear: "LinearDraws | None" = None, draws: int | None = None
-) -> float:
-    """What `Draws.ratio` is above that of `linear_draws`, by tracing the largest ``draws``."""
-    linear = linear or linear_draws(plan)
-    count = (draws or _FULL_DRAWS) * _ease(plan.kernels)
-    rows = np.argsort(-linear.ratios)[:count].tolist()
-    ratios = linear.ratios.copy()
-    ratios[rows] = plan.draws(rows=rows).ratios
-    return float(np.quantile(ratios, WITHIN)) - linear.ratio
+def _quantile(ratios: Array) -> float:
+    return float(np.quantile(ratios, WITHIN))
+
+
+def _traced(
+    plan: AimPlan, linear: "LinearDraws", ratios: Array, count: int, done: int = 0
+) -> Array:
+    """Ratios of `linear_draws` with the ``count`` largest traced, of which ``done`` are already."""
+    ease, traced = _ease(plan.kernels), ratios.copy()
+    rows = np.argsort(-linear.ratios)[done * ease : count * ease].tolist()
+    traced[rows] = plan.draws(rows=rows).ratios
+    return traced
 
 
 _FULL_DRAWS, _CONFIRMING_DRAWS = 12, 48
@@ -316,9 +324,7 @@ class _Ascent:
             adam.zero_grad()
             flux = self.kernels.flux(self.places * self.unit, self.active)
             pressure = (self.multipliers + _RHO * self._excess(flux)).clamp(min=0)
-            # Linear above `_MAX_PRESSURE`: far too much light must not be thrown off the receiver.
-            soft = pressure.clamp(max=_MAX_PRESSURE)
-            penalty = (areas * self.limit * soft * (2 * pressure - soft)).sum() / (2 * _RHO)
+            penalty = (areas * self.limit * penalty_of(pressure)).sum()
             ((penalty - (areas * flux).sum()) / total).backward()  # type: ignore[no-untyped-call]
             adam.step()
 
@@ -344,6 +350,16 @@ _SHARE = 0.5
 """Share of a wanted change of the margin that is made at once."""
 
 
+def penalty_of(pressure: Tensor) -> Tensor:
+    """The penalty [of the limit] whose slope by the excess is the ``pressure``.
+
+    It is quadratic up to `_MAX_PRESSURE` and linear above: far too much light must not be thrown
+    off the receiver.
+    """
+    soft = pressure.clamp(max=_MAX_PRESSURE)
+    return soft * (2 * pressure - soft) / (2 * _RHO)
+
+
 class LinearDraws(NamedTuple):
     """Draws of the pointing errors to first order.
 
@@ -361,7 +377,7 @@ class LinearDraws(NamedTuple):
     @property
     def ratio(self) -> float:
         """Quantile `WITHIN` of the ratios; 1 is just within the limit."""
-        return float(np.quantile(self.ratios, WITHIN))
+        return _quantile(self.ratios)
 
 
 def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:

@@ -10,13 +10,14 @@ from model.effects.catalogue import in_light_order
 from model.effects.scope import Since
 from model.mount import Mount
 from model.plant import Heliostat
+from model.setup import Setup
 from model.site import Site
 from model.tracing.scene import Optics, Window
 
 
 def effects_of_stage(effects: Iterable[Effect], *stages: Stage) -> list[Effect]:
     """Effects of some stages."""
-    return [effect for effect in effects if effect.stage in stages]
+    return [effect for effect in effects if not effect.stages.isdisjoint(stages)]
 
 
 def apply_sun_effects(effects: Iterable[Effect], suns: Array, site: Site) -> Array:
@@ -58,8 +59,10 @@ def apply_optics_effects(effects: Iterable[Effect], optics: Optics) -> Optics:
     return optics
 
 
-def apply_image_effects(effects: Iterable[Effect], flux: Tensor, window: Window) -> Tensor:
-    """The camera's images of irradiance (B, rows, columns) over ``window``."""
+def apply_image_effects(
+    effects: Iterable[Effect], flux: Tensor, window: Window, setups: Sequence[Setup], site: Site
+) -> Tensor:
+    """The camera's images of irradiance (B, rows, columns) of B setups over ``window``."""
     for effect in in_light_order(effects):
-        flux = effect.on_image(flux, window)
+        flux = effect.on_images(flux, window, setups, site)
     return flux

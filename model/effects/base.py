@@ -22,6 +22,7 @@ from model.effects.scope import Always, ByDay, Scope
 from model.errors import InvalidInputError
 from model.mount import Mount
 from model.plant import Heliostat
+from model.setup import Setup
 from model.site import Site
 from model.tracing.scene import Optics, Scene, Window
 
@@ -150,6 +151,11 @@ class Effect:
 
     scope: Scope = field(default=Always(), kw_only=True)
 
+    @property
+    def stages(self) -> frozenset[Stage]:
+        """Its stage, or several if it acts at several."""
+        return frozenset({self.stage})
+
     def __post_init__(self) -> None:
         if isinstance(self.scope, ByDay):
             if not all(p.shared for p in self.parameters()):
@@ -177,6 +183,10 @@ class Effect:
     def parameters(cls) -> tuple[Parameter, ...]:
         """The effect's parameters in their order."""
         return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls) if f.metadata)
+
+    def parameters_to_json(self) -> dict[str, Any]:
+        """Values of the parameters, by name, and by heliostat where each has one."""
+        return {p.name: _plain(getattr(self, p.name)) for p in self.parameters()}
 
     @classmethod
     def unseen(cls, mounts: Sequence[Mount]) -> frozenset[str]:
@@ -217,6 +227,10 @@ class Effect:
         """Convert a scene of B mirrors to the real mirrors of B ``heliostats``."""
         return scene
 
+    def on_setups(self, scene: Scene, setups: Sequence[Setup], site: Site) -> Scene:
+        """Convert a scene as `on_scene`, also by what else is known of B setups at a site."""
+        return self.on_scene(scene, [setup.heliostat for setup in setups])
+
     def on_optics(self, optics: Optics) -> Optics:
         """Convert the declared optics to the real optics."""
         return optics
@@ -224,6 +238,21 @@ class Effect:
     def on_image(self, images: Tensor, window: Window) -> Tensor:
         """Convert irradiance (B, rows, columns) over ``window`` to the camera's image."""
         return images
+
+    def on_images(
+        self, images: Tensor, window: Window, setups: Sequence[Setup], site: Site
+    ) -> Tensor:
+        """Convert irradiance as `on_image`, also by what is known of B setups at a site."""
+        return self.on_image(images, window)
+
+
+def _plain(value: Any) -> Any:
+    """Convert tensors and arrays to floats and lists."""
+    if isinstance(value, Mapping):
+        return {name: _plain(one) for name, one in value.items()}
+    return np.asarray(
+        value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64
+    ).tolist()
 
 
 def acting(

@@ -9,9 +9,9 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from model.effects.base import Effect, Parameter
+from model.effects.correction import Correction, correction_from_json
 from model.effects.scope import Always, ByDay, day_from_json, scope_from_json
 from model.errors import InvalidInputError
 
@@ -56,7 +56,7 @@ def in_light_order(effects: Iterable[Effect]) -> list[Effect]:
 
 def light_effects(effects: Iterable[Effect]) -> list[Effect]:
     """Effects on the light itself; the others act on the camera's image."""
-    return [effect for effect in effects if effect.stage != "image"]
+    return [effect for effect in effects if effect.stages != {"image"}]
 
 
 def model_version(effects: Iterable[Effect]) -> str:
@@ -68,13 +68,16 @@ def model_version(effects: Iterable[Effect]) -> str:
 def effects_from_json(data: object) -> list[Effect]:
     """Parse effects from a list, or from an object with the list under ``effects``.
 
-    Such an object is a study's report.
+    Such an object is a study's report. If that has a discrepancy, this is the one effect, a
+    correction: effects that explain only a part are not those of the model.
 
     Raises
     ------
     InvalidInputError
         If it is neither, or an effect is malformed.
     """
+    if isinstance(data, Mapping) and isinstance(data.get("discrepancy"), Mapping):
+        return [correction_from_json({**data, **data["discrepancy"]})]
     entries = data.get("effects") if isinstance(data, Mapping) else data
     if not isinstance(entries, list):
         raise InvalidInputError("'effects' must be a list of effects")
@@ -94,9 +97,12 @@ def effect_from_json(data: object) -> Effect:
     if not isinstance(data, Mapping) or not isinstance(data.get("name"), str):
         raise InvalidInputError(f"an effect must be an object with a 'name', got {str(data)[:80]}")
     name, given = data["name"], data.get("parameters", {})
+    if name == Correction.name:
+        return correction_from_json(given, data.get("scope"))
     if name not in CATALOGUE:
         raise InvalidInputError(
-            f"effect '{name}' is unknown; the catalogue has {', '.join(CATALOGUE)}"
+            f"effect '{name}' is unknown; the catalogue has {', '.join(CATALOGUE)}; an own effect"
+            " needs its file (--effects-from, HELIOTWIN_EFFECTS_FROM)"
         )
     known = {p.name: p for p in CATALOGUE[name].parameters()}
     if not isinstance(given, Mapping):
@@ -109,7 +115,7 @@ def effect_from_json(data: object) -> Effect:
     values = {key: _read(name, known[key], value) for key, value in given.items()}
     scope = scope_from_json(data.get("scope"), name)
     if isinstance(scope, ByDay):
-        scope = ByDay(_by_day(name, known, given))
+        scope = ByDay(_by_day(name, known, given), scope.until)
     effect = CATALOGUE[name](**values, scope=scope)
     named = None if isinstance(scope, ByDay) else scope.heliostats
     if named is not None and effect.heliostats not in (None, list(named)):
@@ -155,7 +161,7 @@ def _bare(data: Any) -> Any:
 
 def effect_to_json(effect: Effect) -> dict[str, Any]:
     """Convert an effect to JSON; `effect_from_json` reads it back."""
-    plain = {p.name: _plain(getattr(effect, p.name)) for p in effect.parameters()}
+    plain = effect.parameters_to_json()
     if effect.scope == Always():
         return {"name": effect.name, "parameters": plain}
     if isinstance(effect.scope, ByDay):
@@ -168,12 +174,3 @@ def effect_to_json(effect: Effect) -> dict[str, Any]:
             for name, value in plain.items()
         }
     return {"name": effect.name, "parameters": plain, "scope": effect.scope.to_json()}
-
-
-def _plain(value: Any) -> Any:
-    """Convert tensors and arrays to floats and lists."""
-    if isinstance(value, Mapping):
-        return {name: _plain(one) for name, one in value.items()}
-    return np.asarray(
-        value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64
-    ).tolist()

@@ -39,15 +39,14 @@ What it is confused with
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from model.effects.base import Effect, Factor, Scalar, Stage, parameter
+from model.effects.deformation import coefficients_of, places_on
 from model.plant import REFERENCE_SINE, Heliostat
-from model.surface import basis, greville
 from model.tracing.scene import Scene
 
 REFERENCE = REFERENCE_SINE
@@ -89,25 +88,8 @@ def _paraboloid(points: Tensor, edges: Tensor, degree: int) -> Tensor:
     """Spline coefficients (B, F, I, J) of a sag that is one at the upper and lower edge.
 
     ``points`` are the facets' (B, F, 3, I, J); ``edges`` (B, 2) [m] are half the mirrors' widths
-    and heights. The sag is interpolated at the Greville abscissae. This is exact if x and y are
-    linear in the parameters, as on heliotwin's grid.
+    and heights.
     """
-    value_u, inverse_u = _collocation(points.shape[-2], degree, points.dtype, points.device)
-    value_v, inverse_v = _collocation(points.shape[-1], degree, points.dtype, points.device)
-    place = value_u @ points[:, :, :2] @ value_v.T / edges[:, None, :, None, None]
+    place = places_on(points, degree) / edges[:, None, :, None, None]
     x, y = place.unbind(2)
-    return inverse_u @ (y**2 + ALONG * x**2) @ inverse_v.T
-
-
-class _Collocation(NamedTuple):
-    """Matrix (count, count) from coefficients to values at the Greville abscissae; its inverse."""
-
-    values: Tensor
-    inverse: Tensor
-
-
-@lru_cache(maxsize=16)
-def _collocation(count: int, degree: int, dtype: torch.dtype, device: torch.device) -> _Collocation:
-    values = torch.as_tensor(basis(count, degree, greville(count, degree)).values)
-    inverse = torch.linalg.inv(values)
-    return _Collocation(*(m.to(dtype=dtype, device=device) for m in (values, inverse)))
+    return coefficients_of(y**2 + ALONG * x**2, degree)

@@ -87,18 +87,24 @@ class ByDay:
     ----------
     by_day : mapping
         Day to parameter values by name; on other days, the effect's own values count.
+    until : date or None
+        First of the other days without the effect; None while it acts.
     """
 
     by_day: Mapping[date, Mapping[str, float]] = field(default_factory=dict)
+    until: date | None = None
 
     def phase(self, taken_at: datetime | None, heliostat: str | None) -> date | bool:
         """As `Always.phase`."""
         day = None if taken_at is None else taken_at.date()
-        return day if day is not None and day in self.by_day else True
+        if day is not None and day in self.by_day:
+            return day
+        return self.until is None or (day is not None and day < self.until)
 
     def to_json(self) -> dict[str, Any]:
         """The scope as JSON; the values are with the parameters."""
-        return {"kind": "day"}
+        until = {} if self.until is None else {"until": self.until.isoformat()}
+        return {"kind": "day"} | until
 
 
 Scope = Always | Since | ByDay
@@ -121,18 +127,14 @@ def scope_from_json(data: object, effect: str) -> Scope:
     heliostats = _heliostats_from_json(given.get("heliostats"), effect)
     if given["kind"] == "set":
         return Always(heliostats)
+    until = None if given.get("until") is None else day_from_json(given["until"], effect)
     if given["kind"] == "since":
-        until = given.get("until")
-        return Since(
-            day_from_json(given.get("since"), effect),
-            heliostats,
-            None if until is None else day_from_json(until, effect),
-        )
+        return Since(day_from_json(given.get("since"), effect), heliostats, until)
     if heliostats is not None:
         raise InvalidInputError(
             f"effect {effect}: a scope by day is of all heliostats; leave its 'heliostats' out"
         )
-    return ByDay()
+    return ByDay(until=until)
 
 
 def _heliostats_from_json(data: object, effect: str) -> tuple[str, ...] | None:

@@ -194,6 +194,16 @@ class Camera:
         over = (self.peak_counts - self.ambient) * share / max(largest, 1e-12)
         return law.light(self.ambient + over) - law.light(self.ambient)
 
+    def counts_of_difference(self, light: ArrayLike, depth: DTypeLike = np.uint8) -> Array:
+        """Counts (...) [1] above the sheet of a spot's ``light`` (...), which may have any unit.
+
+        The inverse of `light_of_difference`: the brightest position has `peak_counts`.
+        """
+        law, share = self.law(depth), np.asarray(light, dtype=np.float64)
+        sheet, peak = law.light((self.ambient, self.peak_counts))
+        spot = (peak - sheet) * share / max(float(share.max(initial=0)), 1e-12)
+        return law.counts(sheet + spot) - self.ambient
+
 
 def camera_at(cameras: Sequence[Camera], target: str, taken_at: datetime | None) -> Camera | None:
     """The camera of a target at a time; None if none is declared.

@@ -67,6 +67,8 @@ class MeasuredFlux:
         The target's corners in a ``raw`` image: upper left, upper right, lower left, lower right.
     clipped : bool (256, 256) or None
         Saturated pixels on the target, if any: the real light is at least as much.
+    square : float32 (64, 64) or None
+        All of an image of the kind ``flux-centered``, sum 100.
     """
 
     quality: Quality
@@ -77,6 +79,7 @@ class MeasuredFlux:
     crop: NDArray[np.uint8] | None = None
     corners: NDArray[np.float64] | None = None
     clipped: NDArray[np.bool_] | None = None
+    square: NDArray[np.float32] | None = None
 
 
 def measure(
@@ -323,7 +326,10 @@ def _measure_centered(image: NDArray[np.float32], side: float) -> MeasuredFlux:
     _, centered, outside = _center(flux, (side, side))
     main, foreign = find_spots(flux.astype(np.float32), noise=float(flux.max()) / 255)
     quality = judge_flux(flux, main, outside, float(flux[foreign].sum() / flux.sum()))
-    return MeasuredFlux(quality, centered=centered) if quality.accepted else MeasuredFlux(quality)
+    if not quality.accepted:
+        return MeasuredFlux(quality)
+    square = _normalised(flux_window(flux, (side, side), window=side))
+    return MeasuredFlux(quality, centered=centered, square=square)
 
 
 class _Centered(NamedTuple):

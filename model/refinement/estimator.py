@@ -67,6 +67,9 @@ from model.surface import control_points
 
 Array = NDArray[np.float64]
 
+MIN_CROSS_VALIDATED, MAX_CROSS_VALIDATED = 2, 8
+"""Numbers of images that each may be predicted from the others; more determine a mirror."""
+
 DIMMING = 0.1
 """Share of a facet's light in finite differences of the images."""
 
@@ -130,7 +133,7 @@ def refine(
     )
     steps.total = (
         options.rounds
-        + n_minimizations(len(observations))
+        + options.with_half_samples * n_minimizations(len(observations))
         + n_other_minimizations(len(heliostat.facets), options)
     )
     images = ImageModel(
@@ -174,6 +177,7 @@ def refine(
         mahalanobis_distance=prior.mahalanobis(z),
         contradicting=tuple(observations[i].identifier for i in fit.excluded),
         warnings=tuple(against),
+        is_start_better=start is not None and _is_start_better(fit, linearization, start),
     )
 
 
@@ -197,7 +201,7 @@ def fit_consistent_images(
 def add_ripples(fit: SurfaceFit) -> SurfaceFit:
     """Add the coefficients of ripples, which are zero at first."""
     state, hyper = fit.mode.state, fit.mode.hyper
-    model = fit.model.with_ripples(state, fit.mode.whitener(fit.model.side))
+    model = fit.model.with_ripples(state, fit.mode.whitener(fit.model))
     count = len(model.ripples)
     state = replace(state, coefficients=np.concatenate([state.coefficients, np.zeros(count)]))
     hyper = replace(hyper, precision=np.concatenate([hyper.precision, np.ones(count)]))
@@ -227,10 +231,26 @@ def estimate_hyperparameters(fit: SurfaceFit, options: RefinementOptions) -> Sur
 
 def estimate_facet_light(fit: SurfaceFit, linearization: Linearization) -> FacetLight:
     """Estimate how much light each facet sends, together with the surface."""
-    whitener = fit.mode.whitener(fit.model.side)
+    whitener = fit.mode.whitener(fit.model)
     return linearization.facet_light(
         whitener(fit.model.dim_facets(fit.mode.state, DIMMING)) / DIMMING
     )
+
+
+def _is_start_better(fit: SurfaceFit, linearization: Linearization, start: Array) -> bool:
+    """Whether a few images agree better with the ``start`` (F, 8, 8) [m] than with the surface
+    from the other images.
+
+    The start is the network's, whose learnt errors are small where a few images leave much open.
+    """
+    model = fit.model
+    if not MIN_CROSS_VALIDATED <= len(model.observations) <= MAX_CROSS_VALIDATED:
+        return False
+    smooth, nothing = model.prior.coefficients(start), np.zeros(len(model.ripples))
+    state = model.state(np.concatenate([smooth, nothing]))
+    by_start = fit.mode.whitener(model)(model.measured - state.images)
+    by_others = linearization.leave_one_out_residuals()
+    return bool((by_start**2).mean() < (by_others**2).mean())
 
 
 def _information_shares(fit: SurfaceFit, linearization: Linearization) -> tuple[float, ...]:

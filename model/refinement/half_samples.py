@@ -88,7 +88,7 @@ def half_sample_covariance(
     """
     smooth = slice(len(model.prior.basis))
     shared = linearization.shared_error_covariance(options.min_sigma)[smooth, smooth]
-    if len(model.suns) < 2:
+    if len(model.suns) < 2 or not options.with_half_samples:
         return shared
     model.steps.phase = "comparing half-samples of the images"
     with ThreadPoolExecutor(N_THREADS) as threads:

@@ -57,7 +57,7 @@ class RefinementOptions:
         Smallest standard deviation of the noise in a band.
     annealing : tuple of float [of the peak]
         Noise of successive minimizations before the noise is estimated: large features converge
-        before small ones.
+        before small ones. Less noise than the images have is left out (`anneal`).
     max_annealed : int
         Largest number of images for annealing; the suns of those are far apart.
     rounds : int
@@ -65,6 +65,9 @@ class RefinementOptions:
     with_ripples : bool
         Whether the mirror has ripples. Only simulated mirrors that were made of 8 x 8 heights have
         none.
+    with_half_samples : bool
+        Whether halves of the images widen the covariance. Without them the surface is the same, its
+        intervals are too narrow, and half of the time is saved.
     resolution : int
         Pixels along a side of the compared images.
     samples : int
@@ -79,6 +82,7 @@ class RefinementOptions:
     max_annealed: int = 8
     rounds: int = 3
     with_ripples: bool = True
+    with_half_samples: bool = True
     resolution: int = COARSE_SIZE
     samples: int = 32
     max_steps: int = 12
@@ -114,11 +118,21 @@ def anneal(
     minimizer: MinimizerOptions,
     noise_levels: Sequence[float],
 ) -> Mode:
-    """Minimize the cost for one noise level [of the peak] after the other."""
+    """Minimize the cost for one noise level [of the peak] after the other, down to the images' own.
+
+    Errors of real photographs are smooth: less noise would bend the mirror to explain them, and end
+    at another mirror.
+    """
+    left = 0.0
     for sigma in noise_levels:
+        if sigma < left:
+            model.steps.advance()
+            continue
         hyper = Hyperparameters.uniform(sigma, len(state.coefficients))
         mode = find_optimum(model, Mode(state, jacobian, hyper), minimizer)
         state, jacobian = mode.state, mode.jacobian
+        white = mode.whitener(model)(model.measured - state.images)
+        left = sigma * float(np.sqrt((white**2).mean()))
     return mode
 
 

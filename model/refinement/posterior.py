@@ -77,9 +77,10 @@ class Mode:
     hyper: Hyperparameters
     cost: float = np.nan
 
-    def whitener(self, side: float) -> Whitener:
-        """The whitener of the state's images of a width [m]."""
-        return Whitener(self.state.images, self.hyper.sigma, DARK_SHARE, side)
+    def whitener(self, model: ImageModel) -> Whitener:
+        """The whitener of the state's images, which are those of a model."""
+        size_errors = np.array([o.size_error for o in model.observations])
+        return Whitener(self.state.images, self.hyper.sigma, DARK_SHARE, model.side, size_errors)
 
 
 class PosteriorCost:
@@ -89,7 +90,7 @@ class PosteriorCost:
         self.model, self.precision, self.whitener = (
             model,
             mode.hyper.precision,
-            mode.whitener(model.side),
+            mode.whitener(model),
         )
 
     def cost(self, state: SurfaceState) -> float:
@@ -251,13 +252,20 @@ class Linearization:
     def leave_one_out_errors(self) -> Array:
         """Mean square error (M,) with which all other images predict each image, to first order.
 
-        By how much the cost falls without the image, divided by the number of its modes. The
-        surface without it differs by ``(I - C F_i)^-1 C g_i``.
+        By how much the cost falls without the image, divided by the number of its modes.
+        """
+        return np.asarray((self.leave_one_out_residuals() * self.residual).mean(axis=1))
+
+    def leave_one_out_residuals(self) -> Array:
+        """Residuals (M, n) of each image by the surface from all others, to first order.
+
+        The surface without image i differs by ``(I - C F_i)^-1 C g_i``.
         """
         others = np.eye(len(self.covariance)) - self.information @ self.covariance
         change = np.linalg.solve(others, self.scores[..., None])[..., 0] @ self.covariance
-        predicted = self.residual + np.einsum("mk,kmn->mn", change, self.jacobian, optimize=True)
-        return np.asarray((predicted * self.residual).mean(axis=1))
+        return np.asarray(
+            self.residual + np.einsum("mk,kmn->mn", change, self.jacobian, optimize=True)
+        )
 
     def facet_light(self, jacobian: Array) -> FacetLight:
         """Estimate the light of each facet together with the surface.
@@ -286,7 +294,7 @@ class Linearization:
 
 def linearize(model: ImageModel, mode: Mode) -> Linearization:
     """The Gaussian approximation of the posterior at a mode."""
-    whitener = mode.whitener(model.side)
+    whitener = mode.whitener(model)
     white = whitener(np.concatenate([mode.jacobian, model.ripples]))
     return Linearization(
         mode.hyper, white, whitener(model.measured - mode.state.images), whitener.bands

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.fft import dct
 
-from model.nuisances import nuisances
+from model.nuisances import nuisances, size_nuisance
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,8 @@ class Whitener:
         Flux above which the noise grows with the root of the flux.
     side : float [m]
         Width of the images.
+    size_errors : (M,) [1]
+        Relative standard deviations of that width.
 
     Attributes
     ----------
@@ -53,7 +55,9 @@ class Whitener:
         Index of the band of each mode of the cosine transform.
     """
 
-    def __init__(self, images: Array, sigma: Array, dark_share: float, side: float) -> None:
+    def __init__(
+        self, images: Array, sigma: Array, dark_share: float, side: float, size_errors: Array
+    ) -> None:
         peak, frequencies = images.max(axis=(1, 2), keepdims=True), np.arange(images.shape[-1])
         frequencies = frequencies[frequencies < BANDS[-1]]
         frequency = np.hypot(*np.meshgrid(frequencies, frequencies))
@@ -62,9 +66,12 @@ class Whitener:
         self.bands = np.digitize(frequency[self._is_used], BANDS)
         self._scale = peak * np.sqrt(np.clip(images / peak, 0, None) + dark_share)
         self._sigma = sigma[:, self.bands]
-        scaled = self._divide_by_noise(
-            nuisances(torch.as_tensor(images), side).numpy().swapaxes(0, 1)
-        )
+        seen = torch.as_tensor(images)
+        free = nuisances(seen, side)
+        if size_errors.any():
+            sized = size_nuisance(seen) * torch.as_tensor(size_errors)[:, None, None]
+            free = torch.cat([free, sized[:, None]], dim=1)
+        scaled = self._divide_by_noise(free.numpy().swapaxes(0, 1))
         _, singular, self._directions = np.linalg.svd(scaled.swapaxes(0, 1), full_matrices=False)
         self._shrinkage = 1 - 1 / np.sqrt(1 + singular**2)
 

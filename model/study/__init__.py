@@ -6,7 +6,8 @@ gain.
 The modules in the order of the data: `flux_images` (measured images and their forecasts),
 `parameters` (effects as a vector), `fitting` (least squares), `trials` (fit one part, forecast the
 held-out part), `scopes` and `scope_search` (when and where an effect acts), `judging` and
-`selection` (gains on held-out images), `loop`, `outcome` and `report`.
+`selection` (gains on held-out images), `loop`, `generic_terms` and `discrepancy` (what has no
+name), `halves` (what drifts is no cause), `outcome` and `report`.
 """
 
 from model.study.flux_images import FluxImage

@@ -18,11 +18,6 @@ PHOTOGRAPHS: dict[Factor, str] = {
 }
 """Factors, each with the photographs that vary it, the most informative first."""
 
-SCALES_WITH: dict[str, frozenset[Factor]] = {
-    name: effect.scales_with for name, effect in CATALOGUE.items()
-}
-"""What changes each effect's mark in an image; what is not named leaves it alone."""
-
 SAME_SCALING = (
     "a lamp or an edge of known shape on the target, for both effects are the camera's own"
 )
@@ -32,6 +27,6 @@ MOST = 2
 
 def photographs_to_distinguish(first: str, second: str) -> str:
     """The photographs that would distinguish two effects of the catalogue."""
-    differ = SCALES_WITH[first] ^ SCALES_WITH[second]
+    differ = CATALOGUE[first].scales_with ^ CATALOGUE[second].scales_with
     wanted = [photographs for factor, photographs in PHOTOGRAPHS.items() if factor in differ]
     return ", and ".join(wanted[:MOST]) or SAME_SCALING

@@ -152,7 +152,7 @@ class Fitter:
             [part.reshape(count, len(self.measured), -1) for part in parts], axis=-1
         )
 
-    def _take_off_grid(self, unknowns: ParameterVector, begin: Array) -> None:
+    def take_off_grid(self, unknowns: ParameterVector, begin: Array) -> None:
         """Add the difference of coarse and fine forecasts at ``begin`` to the measured images."""
         if self.fine is not None:
             model = [*self.fixed, *unknowns.acting(begin)]
@@ -198,7 +198,7 @@ class Fitter:
     ) -> Fit:
         """Fit from the most promising starts; ``free`` (P,) unknowns may start elsewhere."""
         free = np.full(len(begin), True) if free is None else free
-        self._take_off_grid(unknowns, begin)
+        self.take_off_grid(unknowns, begin)
         starts = find_starts(self, unknowns, begin, free)
         promising = [s.values for s in starts if not s.cost > WORST_START * starts[0].cost]
         fits = (self.descend(unknowns, values) for values in promising[:tries])

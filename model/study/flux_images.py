@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model.effects import Effect, effect_to_json
+from model.covariates import slant_range
+from model.effects import Effect, Stage, effect_to_json, effects_of_stage
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View, align
 from model.frames import sun_angles
@@ -99,7 +100,7 @@ class FluxImage:
     @property
     def slant_range(self) -> float:
         """Distance [m] from the heliostat to its target."""
-        return float(np.linalg.norm(self.setup.heliostat.position - self.setup.plane.center))
+        return slant_range(self.setup)
 
     def sent(
         self, nominal: Heliostat, mount: CalibratedMount, motors: Array | None, day: float
@@ -351,13 +352,13 @@ class Forecaster:
             )
         return cuts
 
-    def displaced(self, effects: Sequence[Effect]) -> Array:
-        """How far spots lie (N, 2) [rad] from where their motors sent them under the declared
-        effects and these.
+    def aligned(self, effects: Sequence[Effect]) -> Aligned:
+        """The aligned setups under the declared effects and these. Raises as `cuts`."""
+        return self._trace(self.model.with_effects(effects)).aligned
 
-        NaN where motors are not known. Raises as `cuts`.
-        """
-        return self._trace(self.model.with_effects(effects)).aligned.displacements
+    def displaced(self, effects: Sequence[Effect]) -> Array:
+        """How far spots lie (N, 2) [rad] from where motors sent them; NaN where that is unknown."""
+        return self.aligned(effects).displacements
 
     def position_residuals(self, effects: Sequence[Effect]) -> Array:
         """The same (N, 2) in independent standard deviations (`model.study.position`)."""
@@ -410,5 +411,5 @@ class Forecaster:
         return TracedFlux(aligned, self._flux[light])
 
 
-def _name(effects: Sequence[Effect], stages: tuple[str, ...]) -> str:
-    return json.dumps([effect_to_json(effect) for effect in effects if effect.stage in stages])
+def _name(effects: Sequence[Effect], stages: tuple[Stage, ...]) -> str:
+    return json.dumps([effect_to_json(effect) for effect in effects_of_stage(effects, *stages)])

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,8 @@ def split(flux_images: Sequence[FluxImage]) -> Split:
     The images are in order of their days, if most have one, and of the sun's elevation. So fits and
     judges see the same days. One heliostat of several is excluded from the fits of shared effects:
     the one of median distance, within the range of the others. Images that surfaces were predicted
-    from do not judge, unless fewer than `FRESH` others are left; the report says so.
+    from are fitted and do not judge, unless fewer than `FRESH` others are left; the report says so.
+    Of the others, those of days before or after them are split: a change may have come between.
     """
     seen, known_days = [p.seen for p in flux_images], days_of(flux_images)
     dated = known_days is not None
@@ -74,14 +76,11 @@ def split(flux_images: Sequence[FluxImage]) -> Split:
     for number, name in enumerate(sorted(names, key=lambda name: name == kept)):
         rows = [row for row, p in enumerate(flux_images) if p.heliostat == name]
         rows.sort(key=lambda row: (days[row], flux_images[row].elevation_deg, flux_images[row].key))
+        used = [row for row in rows if judged_apart and seen[row]]
+        span = [days[row] for row in used]
+        apart = [row for row in rows if not used or not min(span) <= days[row] <= max(span)]
         # Even on a day with one image per heliostat, some are fitted and some judge.
-        fitted = (
-            [row for row in rows if seen[row]]
-            if judged_apart
-            else rows[number % 2 if dated else 0 :: 2]
-        )
-        if not fitted:  # no surface was predicted from images of this heliostat
-            fitted = rows[::2]
+        fitted = used + apart[number % 2 if dated else 0 :: 2]
         parts["own" if name == kept else "fit"] += fitted
         parts["held_out"] += [row for row in rows if row not in fitted]
     return Split(
@@ -97,6 +96,13 @@ class Gain:
     low: float
     high: float
     score: float
+
+
+class BeforeAfter(NamedTuple):
+    """A figure without and with effects or corrections."""
+
+    before: float
+    after: float
 
 
 def paired_gain(
@@ -126,6 +132,11 @@ def paired_gain(
     return Gain(
         mean, float(low), float(high), mean / max(float(drawn.bootstrap_distribution.std()), 1e-9)
     )
+
+
+def gain_to_json(gain: Gain) -> dict[str, Any]:
+    """A gain in a report."""
+    return {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]}
 
 
 USUAL, USUAL_SCATTER = 2, 0.01

@@ -1,12 +1,19 @@
 """The closed loop: add the effect with the largest gain, until none is worthwhile."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 from model.effects import CATALOGUE, Always, ByDay, Effect
+from model.effects.catalogue import ORDER
 from model.errors import InvalidInputError
+from model.forecast import align
 from model.plant_model import PlantModel
+from model.study.discrepancy import find_discrepancy
 from model.study.flux_images import FluxImage
-from model.study.outcome import Candidate, Found, Study
+from model.study.halves import find_drifts
+from model.study.judging import paired_gain
+from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
 from model.study.parameters import Term
 from model.study.scope_search import ScopeSearch
 from model.study.selection import ForwardSelection
@@ -43,6 +50,7 @@ def study(
     options = options or StudyOptions()
     _check(flux_images)
     fitter = TrialFitter(flux_images, model, options)
+    _check_own(flux_images, model, options)
     scopes = ScopeSearch(fitter)
     selection = ForwardSelection(fitter, scopes)
     before = current = fitter.fit([])
@@ -83,7 +91,8 @@ def study(
         left = [
             other for other in left if other.kind is not term.kind or term.heliostats is not None
         ]
-    return _outcome(fitter, before, current, found, candidates)
+    outcome = _outcome(fitter, before, current, found, candidates)
+    return _contradict(fitter, outcome, before, current, progress)
 
 
 def _check(flux_images: Sequence[FluxImage]) -> None:
@@ -93,6 +102,17 @@ def _check(flux_images: Sequence[FluxImage]) -> None:
         )
     if len({p.key for p in flux_images}) < len(flux_images):
         raise InvalidInputError("photographs of a study must have different identifiers")
+
+
+def _check_own(flux_images: Sequence[FluxImage], model: PlantModel, options: StudyOptions) -> None:
+    """Let effects that a plant wrote fail in words: fits take any failure for a bad value."""
+    for name in options.candidates:
+        if name not in ORDER:
+            (amplitude,) = CATALOGUE[name].parameters()
+            slight: dict[str, Any] = {amplitude.name: 0.01 * (amplitude.high or amplitude.low)}
+            effect = CATALOGUE[name](**slight)
+            aligned = align([p.setup for p in flux_images], model.with_effects([effect]))
+            aligned.images(options.fit_view)
 
 
 def _candidate_terms(
@@ -155,6 +175,37 @@ def _outcome(
         effects=current.effects,
         site=fitter.model.site,
     )
+
+
+def _contradict(
+    fitter: TrialFitter,
+    outcome: Study,
+    before: Trial,
+    current: Trial,
+    progress: Callable[[str], None],
+) -> Study:
+    """Add the discrepancy, and what contradicts the effects found."""
+    reasons = []
+    if outcome.leaves_little:
+        progress("halves of the photographs")
+        reasons = [f"{term.kind.name} drifts" for term in find_drifts(fitter, current)]
+    if outcome.found and outcome.unexplained_share <= MIN_RIVAL and not reasons:
+        return outcome  # no term can gain what would contradict them
+    if not outcome.found and not outcome.has_unexplained_error:
+        return outcome
+    progress("terms outside the catalogue")
+    discrepancy = find_discrepancy(fitter, before, outcome.noise_floor)
+    if outcome.leaves_little and outcome.has_unexplained_error:
+        least = MIN_RIVAL * outcome.excess_error
+        added = find_discrepancy(fitter, current, outcome.noise_floor, max_terms=1)
+        if added is not None and added.gain.mean >= least:
+            reasons.append(f"{added.described} gains more")
+        if discrepancy is not None:
+            change = paired_gain(discrepancy.accuracy - current.accuracy, fitter.judged_heliostats)
+            if change.low > 0 and change.mean >= least:
+                reasons.append(f"{discrepancy.described} alone gains more")
+    judged = replace(outcome, contradicted_by=reasons)
+    return judged if judged.verdict == "effect" else replace(judged, discrepancy=discrepancy)
 
 
 def _names(term: Term, others: Sequence[Term]) -> list[str]:

@@ -4,17 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.covariates import covariates_of
 from model.effects import Always, Effect
 from model.metrics import flux_accuracies
 from model.site import Site
-from model.study.covariates import covariates_of
+from model.study.discrepancy import Discrepancy
 from model.study.flux_images import FluxImage, noise_floor
-from model.study.judging import Gain, rank_correlation
+from model.study.judging import BeforeAfter, Gain, rank_correlation
 from model.study.parameters import ParameterVector, Term
 from model.study.pattern import Pattern, pattern_of
 from model.study.position import EXPECTED, NAT, is_known, loss
@@ -27,8 +28,15 @@ TOLERANCE = 0.006
 effect have less (two tracers, resampling, surfaces of finite resolution).
 """
 
-SHARE = 1 / 3
-"""Smallest share of that error that the effects found must remove for the verdict "effect"."""
+MAX_LEFT = 2 / 3
+"""Largest share of that error that the effects found may leave for the verdict "effect".
+
+True effects leave up to 0.02 of pure light, but 0.4 of photographs of a target's sheet, whose marks
+move light about. So what imitates a true effect is found by what gains more.
+"""
+
+MIN_RIVAL = 0.1
+"""Smallest share of that error that a generic term must gain to contradict the effects found."""
 
 SHARED = 0.02
 """Standard deviation of the error that all images share, in shares of a parameter's distance from
@@ -145,31 +153,20 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:MAX_LISTED]) + (f" and {n_more} more" if n_more > 0 else "")
 
 
-class BeforeAfter(NamedTuple):
-    """A figure of the declared model, and of the model with the effects found."""
-
-    before: float
-    after: float
-
-
 @dataclass(frozen=True, eq=False)
 class Study:
     """The outcome of a study.
 
     Attributes
     ----------
-    images : sequence of FluxImage
-        The H held-out images, which judge.
-    n_fitted : int
-        Number of the other images, which were fitted.
+    images : sequence of FluxImage, n_fitted : int
+        The H held-out images, which judge, and the number of those that were fitted.
     window : float [m]
         Side of the squares that were compared.
     measured, before, after : (H, 64, 64)
-        Cuts of sum one: photographs, forecasts of the declared model, forecasts with the effects
-        found.
+        Cuts of sum one: photographs, and forecasts without and with the effects found.
     position_residuals_before, position_residuals_after : (H, 2)
-        Offsets of the spots from where motors sent them, in independent standard deviations; NaN
-        if motors are not known.
+        Offsets of spots from where motors sent them, in standard deviations; NaN if unknown.
     displaced_before, displaced_after : (H, 2) [rad]
         The same offsets as angles.
     found : list of Found
@@ -178,6 +175,10 @@ class Study:
     effects : list of Effect
         The effects found, ready to be adopted.
     site : Site
+    discrepancy : Discrepancy or None
+        What terms outside the catalogue correct, where no effect is the cause.
+    contradicted_by : list of str
+        Why the effects found are not the cause, although they leave little.
     """
 
     images: Sequence[FluxImage]
@@ -194,6 +195,8 @@ class Study:
     candidates: list[Candidate]
     effects: list[Effect]
     site: Site
+    discrepancy: Discrepancy | None = None
+    contradicted_by: list[str] = field(default_factory=list)
 
     @cached_property
     def accuracy_before(self) -> Array:
@@ -226,8 +229,13 @@ class Study:
     @property
     def unexplained_share(self) -> float:
         """Share of the error beyond noise that the effects found leave; zero if it is small."""
-        first = self._excess_error(self.accuracy_before, self.position_residuals_before)
+        first = self.excess_error
         return min(1.0, self._error_left / first) if first > TOLERANCE else 0.0
+
+    @property
+    def excess_error(self) -> float:
+        """Mean error of the declared model beyond noise, of shape and of position."""
+        return self._excess_error(self.accuracy_before, self.position_residuals_before)
 
     @property
     def _error_left(self) -> float:
@@ -241,11 +249,22 @@ class Study:
         )
 
     @property
+    def leaves_little(self) -> bool:
+        """Whether the effects found leave so little that they may be the cause."""
+        is_little = self.unexplained_share <= MAX_LEFT or not self.has_unexplained_error
+        return bool(self.found) and is_little
+
+    @property
     def verdict(self) -> Verdict:
         """Whether an effect explains the error, the error needs no explanation, or none does."""
-        if self.found and self.unexplained_share <= 1 - SHARE:
+        if self.leaves_little and not self.contradicted_by:
             return "effect"
-        return "unexplained" if self.has_unexplained_error and not self.is_pattern else "none"
+        return "unexplained" if self.found or self.has_unexplained_error else "none"
+
+    @property
+    def partly(self) -> list[str]:
+        """Names of effects that gain, but are not the cause."""
+        return [found.name for found in self.found] if self.verdict == "unexplained" else []
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -254,11 +273,9 @@ class Study:
 
     @property
     def is_pattern(self) -> bool:
-        """Whether most of the error that is left is a pattern of the target, not of the light.
-
-        The mean magnitude of deviations is 0.8 of their standard deviation ``depth``.
-        """
+        """Whether most of the error that is left is a pattern of the target, not of the light."""
         left = self._error_left
+        # The mean magnitude of deviations is 0.8 of their standard deviation.
         return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
 
     @property
@@ -274,7 +291,7 @@ class Study:
     def covariates(self) -> dict[str, float]:
         """Rank correlations of the error that is left with covariates, the strongest first."""
         error = 1 - self.accuracy_after
-        known = covariates_of(self.images, self.site)
+        known = covariates_of([p.setup for p in self.images], self.site)
         found = {
             covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()
         }

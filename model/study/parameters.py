@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.effects import Always, ByDay, Effect, Parameter, Scope, Since
+from model.effects.correction import Correction
 from model.least_squares import Bounds
 
 Array = NDArray[np.float64]
@@ -338,6 +339,8 @@ def copied(effect: Effect, count: int) -> Effect:
         scope = replace(
             scope, heliostats=tuple(copy_name(h, m) for m in range(count) for h in scope.heliostats)
         )
+    if isinstance(effect, Correction):
+        effect = effect.copied(lambda name: [copy_name(name, m) for m in range(count)])
     changes: dict[str, Any] = {
         p.name: {
             copy_name(h, m): v for m in range(count) for h, v in getattr(effect, p.name).items()

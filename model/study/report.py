@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from model.study.advice import photographs_to_distinguish
-from model.study.judging import Gain
+from model.study.judging import gain_to_json
 from model.study.outcome import Array, Candidate, Found, Study
 
 
@@ -53,9 +53,11 @@ def _verdict_in_words(study: Study) -> str:
             " it significantly."
         )
     part = f"; {names} explains part of it ({after:.1%})" if names else ""
+    reasons = f", but {' and '.join(study.contradicted_by)}" if study.contradicted_by else ""
+    unnamed = f" {study.discrepancy.in_words()}" if study.discrepancy is not None else ""
     return (
         "Something is missing that no effect of the catalogue explains: accuracy"
-        f" {before:.1%}{part}{_position_in_words(study)}."
+        f" {before:.1%}{part}{reasons}{_position_in_words(study)}.{unnamed}"
     )
 
 
@@ -88,13 +90,15 @@ def study_to_json(study: Study) -> dict[str, Any]:
         "after": after,
         "noise_floor": round(study.noise_floor, 5),
         "unexplained_share": round(study.unexplained_share, 4),
+        "partly": study.partly,
+        "discrepancy": _discrepancy(study),
         "effects": [_effect(found) | _whole_gain(study, found) for found in study.found],
         "candidates": [
             {
                 "name": candidate.name,
                 "accuracy_after": round(candidate.accuracy_after, 5),
                 "score": round(candidate.gain.score, 2),
-                "accuracy_gain": _gain(candidate.accuracy_gain),
+                "accuracy_gain": gain_to_json(candidate.accuracy_gain),
                 **_whole_gain(study, candidate),
             }
             for candidate in study.candidates
@@ -115,6 +119,13 @@ def study_to_json(study: Study) -> dict[str, Any]:
     }
 
 
+def _discrepancy(study: Study) -> dict[str, Any] | None:
+    found = study.discrepancy
+    if found is None:
+        return None
+    return found.to_json() | {"per_image": _accuracy(study, found.accuracy)["per_image"]}
+
+
 def _accuracy(study: Study, accuracy: Array) -> dict[str, Any]:
     return {
         "accuracy_mean": round(float(accuracy.mean()), 5),
@@ -127,11 +138,7 @@ def _accuracy(study: Study, accuracy: Array) -> dict[str, Any]:
 
 def _whole_gain(study: Study, effect: Candidate | Found) -> dict[str, Any]:
     """The gain by shape and position, if a position is known."""
-    return {"gain": _gain(effect.gain)} if study.has_position.any() else {}
-
-
-def _gain(gain: Gain) -> dict[str, Any]:
-    return {"mean": round(gain.mean, 5), "ci95": [round(gain.low, 5), round(gain.high, 5)]}
+    return {"gain": gain_to_json(effect.gain)} if study.has_position.any() else {}
 
 
 def _effect(found: Found) -> dict[str, Any]:
@@ -139,7 +146,7 @@ def _effect(found: Found) -> dict[str, Any]:
         "name": found.name,
         "scope": found.scope,
         "parameters": found.parameters,
-        "accuracy_gain": _gain(found.accuracy_gain),
+        "accuracy_gain": gain_to_json(found.accuracy_gain),
         "lookalikes": found.lookalikes,
         "told_apart_by": {
             name: photographs_to_distinguish(found.name, name) for name in found.lookalikes

@@ -76,7 +76,7 @@ class ScopeSearch:
         best = [
             term
             for found in (in_time, single)
-            for term in _screened(found, current.parameters.terms)
+            for term in most_promising(found, current.parameters.terms)
         ]
         return dict(self._fit_span(term, current, dated) for term in best)
 
@@ -146,10 +146,19 @@ def _first_uncalibrated(flux_images: Sequence[FluxImage]) -> date | None:
     return min((day for day in days if day > max(until, default=date.max)), default=None)
 
 
-def _screened(found: Sequence[ScopeCandidate], known: Sequence[Term]) -> list[Term]:
-    """Return the most promising new scopes."""
-    new = sorted(
-        (candidate for candidate in found if candidate.term not in known),
-        key=lambda one: -one.saved,
-    )
-    return [one.term for one in new[:MAX_SCREENED] if one.saved > MIN_SHARE_OF_BEST * new[0].saved]
+def most_promising(found: Sequence[ScopeCandidate], known: Sequence[Term]) -> list[Term]:
+    """Return the most promising new scopes, of effects that only move spots apart from others.
+
+    A target that moved costs more than any change of a shape.
+    """
+    new = [candidate for candidate in found if candidate.term not in known]
+    return [
+        term
+        for only_moves in (False, True)
+        for term in _screened([one for one in new if one.term.kind.only_moves == only_moves])
+    ]
+
+
+def _screened(found: Sequence[ScopeCandidate]) -> list[Term]:
+    best = sorted(found, key=lambda one: -one.saved)[:MAX_SCREENED]
+    return [one.term for one in best if one.saved > MIN_SHARE_OF_BEST * best[0].saved]

@@ -61,7 +61,7 @@ class ForwardSelection:
 
     def __init__(self, fitter: TrialFitter, scopes: ScopeSearch) -> None:
         self.fitter, self.scopes, self.options = fitter, scopes, fitter.options
-        self.heliostats = fitter.heliostats[fitter.split.held_out]
+        self.heliostats = fitter.judged_heliostats
         held_out = [fitter.flux_images[row] for row in fitter.split.held_out]
         has_motors = [p.setup.angles is not None for p in held_out]
         self.noise = noise_floor(held_out, fitter.window) + NAT * EXPECTED * float(

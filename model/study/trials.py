@@ -36,7 +36,7 @@ class StudyOptions:
     the catalogue. ``between`` is called before each forecast; what it raises ends the study.
     """
 
-    candidates: tuple[str, ...] = tuple(CATALOGUE)
+    candidates: tuple[str, ...] = field(default_factory=lambda: tuple(CATALOGUE))
     min_gain: float = 0.004
     most: int = 3
     window: float | None = None
@@ -112,11 +112,13 @@ class TrialFitter:
         self.unknowns = ParameterVector((), tuple(facets), frozenset(unseen))
         self.days = days_of(flux_images)
         self.heliostats = np.array([p.heliostat for p in flux_images])
-        self.judge = self._forecaster(self.split.held_out, options.view)
+        self.judged_heliostats = self.heliostats[self.split.held_out]
+        self.judge = self.forecaster(self.split.held_out, options.view)
         self.measured = self.judge.measured(FLUX_SIZE)
         self._forecasters: dict[bytes, Forecasters] = {}
 
-    def _forecaster(self, rows: Rows, view: View) -> Forecaster:
+    def forecaster(self, rows: Rows, view: View) -> Forecaster:
+        """Return a forecaster of some images."""
         chosen = [self.flux_images[row] for row in rows]
         return Forecaster(chosen, self.model, self.window, view, self.options.between)
 
@@ -125,7 +127,7 @@ class TrialFitter:
         key, views = rows.tobytes(), (self.options.fit_view, self.options.view)
         made = self._forecasters.pop(key, None)
         if made is None:
-            made = Forecasters(*(self._forecaster(rows, view) for view in views))
+            made = Forecasters(*(self.forecaster(rows, view) for view in views))
         self._forecasters[key] = made
         for coarse, fine in list(self._forecasters.values())[:-_RECENT]:
             coarse.forget()

@@ -44,7 +44,8 @@ from model.neighbours import clear
 from model.sunshape import FREQUENCY_COUNT, FREQUENCY_STEP, SunShape, half_angle, transfer_table
 from model.sunshape.base import SOFT_FROM
 from model.surface import edge_basis, midpoint_basis, sample
-from model.tracing.scene import Optics, Scene, Size, Window, irradiance_of, optics_of
+from model.tracing.beam import BeamChange
+from model.tracing.scene import Optics, Scene, Size, Window, by_facet, irradiance_of, optics_of
 
 Result = TypeVar("Result")
 
@@ -101,6 +102,7 @@ class Rays:
     spot_per_angle : Tensor (B, 2) or None [m/rad]
         Movement of the spot, right and up, with a rotation about the mount's first axis, if that is
         known.
+    beam : BeamChange or None
     """
 
     hits: Tensor
@@ -111,6 +113,7 @@ class Rays:
     normal: Tensor
     footprint: Tensor
     spot_per_angle: Tensor | None
+    beam: BeamChange | None = None
 
     @property
     def spot(self) -> Tensor:
@@ -165,9 +168,9 @@ def central_rays(scene: Scene, samples: int) -> Rays:
         if scene.jitter_axis is None
         else _spot_per_angle(scene, scene.jitter_axis, mean_normal, sun, beam, slant_range)
     )
-    return Rays(
-        hits, power, lit, beam, slant_range, mean_normal, _footprint(hits, samples), spot_per_angle
-    )
+    footprint = _footprint(hits, samples)
+    change = _beam_change(scene, beam, slant_range)
+    return Rays(hits, power, lit, beam, slant_range, mean_normal, footprint, spot_per_angle, change)
 
 
 def _covered(coverage: Tensor, samples: int) -> Tensor:
@@ -235,10 +238,31 @@ def _spot_per_angle(
     turned = 2 * (
         (moved * sun).sum(-1, keepdim=True) * normal + (normal * sun).sum(-1, keepdim=True) * moved
     )
-    moved_spot: Tensor = slant_range[:, None] * (
-        turned[:, :2] - beam[:, :2] * turned[:, 2:] / beam[:, 2:]
+    return moved_spot(turned, beam, slant_range)
+
+
+def moved_spot(turned: Tensor, beam: Tensor, slant_range: Tensor) -> Tensor:
+    """Movement (..., 2) [m] of light on the plane as beams (..., 3) turn by ``turned`` (..., 3)."""
+    moved: Tensor = slant_range[..., None] * (
+        turned[..., :2] - beam[..., :2] * turned[..., 2:] / beam[..., 2:]
     )
-    return moved_spot
+    return moved
+
+
+def _beam_change(scene: Scene, beam: Tensor, slant_range: Tensor) -> BeamChange | None:
+    """The scene's change of beams (B, 3) on its planes; None if there is none."""
+    if scene.beam_turns is None or scene.beam_moments is None:
+        return None
+    return BeamChange(beam_moves(scene, scene.beam_turns, beam, slant_range), scene.beam_moments)
+
+
+def beam_moves(scene: Scene, turns: Tensor, beam: Tensor, slant_range: Tensor) -> Tensor:
+    """Movement (B, T, 2) [m/mrad] of light on the planes with ``turns`` (B, T, 3) of the beam.
+
+    ``beam`` (B, 3) is its direction in the planes' frames, and ``slant_range`` (B,) is in metres.
+    """
+    turned = torch.einsum("bij,btj->bti", scene.plane_axes, turns)
+    return moved_spot(turned, beam[:, None], slant_range[:, None])
 
 
 def _footprint(hits: Tensor, samples: int) -> Tensor:
@@ -505,7 +529,7 @@ def trace(
     if samples < 1:
         raise InvalidInputError("samples must be at least one")
     optics = optics or Optics()
-    traced = scene if cones == "mirror" else scene.by_facet()
+    traced = scene if cones == "mirror" else by_facet(scene)
     rays = central_rays(traced, samples)
     parts = len(rays.power) // scene.batch
     spot = rays.spot_of(parts)
@@ -598,6 +622,8 @@ def raster(
     transfer = (
         _cone_transfer(rays, optics, right, up, table) * _patch_transfer(rays, right, up) * unsmear
     )
+    if rays.beam is not None:
+        transfer = transfer * rays.beam.transfer(right, up)
     inner = (
         slice(first_row, first_row + window.rows),
         slice(first_column, first_column + window.columns),

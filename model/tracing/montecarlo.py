@@ -203,6 +203,8 @@ def trace_montecarlo(
     """Trace every mirror of a scene with ``rays`` random rays, at least one."""
     if rays < 1:
         raise InvalidInputError("rays must be at least one")
+    if scene.beam_moments is not None:
+        raise InvalidInputError("this tracer cannot correct beams; use that by convolution")
     optics = optics_of(scene, optics or Optics())
     rng = np.random.default_rng(seed)
     images, spots = [], []

@@ -166,6 +166,10 @@ class Scene:
         Share of each facet's cells within its outline; None for facets that are rectangles.
     reflectance, slope_error, pointing_error : Tensor (B,) or None
         `MirrorOptics` of each mirror, in addition to `Optics`; reflectance times cleanliness.
+    beam_turns : Tensor (B, 4, 3) or None [1/mrad]
+        Changes of the beam's direction in ENU by the turns of `model.tracing.beam`.
+    beam_moments : Tensor (B, 11) or None
+        Moments of those angles, as in `BeamChange`; None for beams that do not change.
     """
 
     control_points: Tensor
@@ -186,6 +190,8 @@ class Scene:
     reflectance: Tensor | None = None
     slope_error: Tensor | None = None
     pointing_error: Tensor | None = None
+    beam_turns: Tensor | None = None
+    beam_moments: Tensor | None = None
 
     @classmethod
     def from_setups(
@@ -237,28 +243,16 @@ class Scene:
     def subset(self, rows: Sequence[int]) -> "Scene":
         """Select some mirrors, in the given order."""
         is_whole = list(rows) == list(range(self.batch))
-        return self if is_whole else self._each(lambda tensor: tensor[list(rows)])
+        return self if is_whole else self.each(lambda tensor: tensor[list(rows)])
 
     def to(self, dtype: torch.dtype) -> "Scene":
         """Convert to another precision."""
-        return self._each(lambda tensor: tensor.to(dtype))
+        return self.each(lambda tensor: tensor.to(dtype))
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Scene":
         """Change every tensor."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
         return self.with_(**{k: change(v) for k, v in tensors.items() if isinstance(v, Tensor)})
-
-    def by_facet(self) -> "Scene":
-        """Make each facet a separate mirror (B * F mirrors); those of one mirror are adjacent."""
-        facets = self.control_points.shape[1]
-        apart = self._each(lambda tensor: tensor.repeat_interleave(facets, dim=0))
-        points = self.control_points.expand(self.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
-        own = {"control_points": points}
-        if self.facet_reflectivity is not None:
-            own["facet_reflectivity"] = self.facet_reflectivity.reshape(-1, 1)
-        if self.coverage is not None:
-            own["coverage"] = self.coverage.flatten(0, 1)[:, None]
-        return apart.with_(**own)
 
     def in_plane(self) -> PlaneScene:
         """Transform the scene to the frame of each target plane.
@@ -280,6 +274,19 @@ class Scene:
         origin = torch.zeros_like(rectangles)
         origin[..., 0, :] = self.plane_center[:, None]
         return (rectangles - origin) @ self.plane_axes.transpose(-1, -2)[:, None]
+
+
+def by_facet(scene: Scene) -> Scene:
+    """Make each facet a separate mirror (B * F mirrors); those of one mirror are adjacent."""
+    facets = scene.control_points.shape[1]
+    apart = scene.each(lambda tensor: tensor.repeat_interleave(facets, dim=0))
+    points = scene.control_points.expand(scene.batch, -1, -1, -1, -1).flatten(0, 1)[:, None]
+    own = {"control_points": points}
+    if scene.facet_reflectivity is not None:
+        own["facet_reflectivity"] = scene.facet_reflectivity.reshape(-1, 1)
+    if scene.coverage is not None:
+        own["coverage"] = scene.coverage.flatten(0, 1)[:, None]
+    return apart.with_(**own)
 
 
 def optics_of(scene: Scene, optics: Optics) -> Optics:

@@ -55,7 +55,11 @@ class HeightChanges:
         return cls(each, directions.flatten(2))
 
     def combine(self, by_shape: Tensor) -> Tensor:
-        """Changes (K, ...) of values whose changes by each facet's shapes are (F * L, ...)."""
+        """Changes (K, ...) of values whose changes by each facet's shapes are (F * L, ...).
+
+        For many more changes than shapes this is faster than `sensitivity` with weights, which adds
+        up before it blurs.
+        """
         if self.weights is None:
             return by_shape
         changes = self.weights.flatten(1) @ by_shape.flatten(1)
@@ -68,6 +72,7 @@ def sensitivity(
     optics: Optics,
     *,
     shapes: Tensor | None = None,
+    weights: Tensor | None = None,
     samples: int = 12,
     padding: float = 0.25,
 ) -> Tensor:
@@ -75,7 +80,8 @@ def sensitivity(
     B mirrors.
 
     ``shapes`` (L, I, J) are what each facet's heights change by, by default each control height
-    alone. Heights are along the facets' normals. Windows on the plane's centre include the rotation
+    alone. With ``weights`` (K, F, L) the derivatives are (K, B, rows, columns), by sums of those.
+    Heights are along the facets' normals. Windows on the plane's centre include the rotation
     of the mount that returns the spot to its place. Other parameters are those of
     `model.tracing.trace`.
 
@@ -96,11 +102,13 @@ def sensitivity(
     slopes = _slopes(scene, samples)
     if shapes is not None:
         slopes = slopes @ shapes.to(slopes).flatten(1).T
-    changes = rays_on_grid.blurred(_sharp(rays_on_grid, moved, slopes))
+    changes = rays_on_grid.blurred(_sharp(rays_on_grid, moved, slopes, weights))
     weight = (rays_on_grid.weight / rays_on_grid.weight.sum(-1, keepdim=True)).view(
         scene.batch, 1, -1, samples**2, 1
     )
     spot = torch.einsum("bafns,sfnk->bafk", moved * weight, slopes).flatten(2)
+    if weights is not None:
+        spot = spot @ weights.to(spot).flatten(1).T
     return changes[:-2] - torch.einsum("bak,abrc->kbrc", spot, changes[-2:])
 
 
@@ -135,18 +143,20 @@ def _slopes(scene: Scene, samples: int) -> Tensor:
     return torch.stack([along_x / wide[:, None, None], along_y / high[:, None, None]])
 
 
-def _sharp(rays_on_grid: Raster, moved: Tensor, slopes: Tensor) -> Tensor:
-    """Derivatives (F * K + 2, B, R, C) of sharp images by heights, and by a shift of all light.
+def _sharp(rays_on_grid: Raster, moved: Tensor, slopes: Tensor, weights: Tensor | None) -> Tensor:
+    """Derivatives (F * L + 2, B, R, C) of sharp images by heights, and by a shift of all light.
 
-    Heights change slopes by ``slopes`` (2, F, N, K) [1/m], and slopes move light by ``moved``
-    (B, 2, F, N, 2) [px]. The last two derivatives are by shifts along columns and along rows
-    [1/px]. The matrix from slopes to pixels is sparse: nine pixels for each sample.
+    Heights change slopes by ``slopes`` (2, F, N, L) [1/m], and slopes move light by ``moved``
+    (B, 2, F, N, 2) [px]. With ``weights`` (K, F, L) they are (K + 2, B, R, C), by sums of heights.
+    The last two derivatives are by shifts along columns and along rows [1/px]. The matrix from
+    slopes to pixels is sparse: nine pixels for each sample.
     """
     batch, _, facets, samples, _ = moved.shape
     index, along = _footprints(rays_on_grid)
     along = (along * rays_on_grid.weight[:, None]).view(2, batch, 9, facets, samples)
     pixels, count = batch * rays_on_grid.shape[0] * rays_on_grid.shape[1], slopes.shape[-1]
-    images = rays_on_grid.x.new_zeros(facets * count + 2, pixels)
+    n_changes = facets * count if weights is None else len(weights)
+    images = rays_on_grid.x.new_zeros(n_changes + 2, pixels)
     images[-2:].index_add_(1, index.flatten(), along.flatten(1))
     by_slope = torch.einsum("abpfn,bafns->sfnbp", along, moved).flatten(3)
     places = index.view(batch, 9, facets, samples).permute(2, 3, 0, 1).flatten(2)
@@ -160,7 +170,10 @@ def _sharp(rays_on_grid: Raster, moved: Tensor, slopes: Tensor) -> Tensor:
         change = (
             csc_array(entries, shape=(pixels, 2 * samples)) @ slopes[:, facet].flatten(0, 1).numpy()
         )
-        images[facet * count : (facet + 1) * count] = torch.from_numpy(change).T
+        if weights is None:
+            images[facet * count : (facet + 1) * count] = torch.from_numpy(change).T
+        else:
+            images[:-2] += weights[:, facet].to(images) @ torch.from_numpy(change).T
     return images.view(-1, batch, *rays_on_grid.shape)
 
 

@@ -28,6 +28,10 @@ class ConflictError(ServiceError):
     """
 
 
+class IdempotencyReuseError(InvalidInputError):
+    """An Idempotency-Key that named another request."""
+
+
 class GoneError(ServiceError):
     """A named resource was deleted from the store."""
 

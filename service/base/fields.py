@@ -4,13 +4,12 @@ Numbers are finite, unknown keys are rejected, and names fit a pattern that is s
 URLs.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import UTC, date, datetime, time, timedelta
 from itertools import islice
 from typing import Annotated, Any, Literal, Self, TypeVar
 from zoneinfo import ZoneInfo
 
-import numpy as np
 from pydantic import (
     AfterValidator,
     AwareDatetime,
@@ -30,6 +29,7 @@ from pydantic import (
 from model.plant import TargetPlane, require_plane_shape
 from service.base.choices import Method as Method  # also used by the command line
 from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
+from service.base.validation_messages import not_a_number
 
 Name = Annotated[
     str,
@@ -64,12 +64,13 @@ Reason = Annotated[Text, Field(min_length=1, max_length=200)]
 Kind = Literal["raw", "cropped", "flux", "flux-centered", "none"]
 Source = Literal["measured", "network", "refined", "imported"]
 Verdict = Literal["effect", "none", "unexplained"]
+Place = Literal["mirror", "angle", "camera", "target", "geometry", "added_light"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 def _is_number(value: Any) -> Any:
     if isinstance(value, bool | str):
-        raise ValueError("must be a number, and neither text nor a truth value")
+        raise ValueError(not_a_number(value))
     return value
 
 
@@ -128,11 +129,34 @@ def parse_moment(moment: datetime) -> datetime:
 Moment = Annotated[AwareDatetime, AfterValidator(parse_moment)]
 
 
+def read_time(text: str) -> datetime:
+    """A time of ISO 8601, also with a blank for T, as ``isoformat`` and REST write it.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    return datetime.fromisoformat(text.strip())
+
+
+def unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """The members of a JSON object, for ``object_pairs_hook``; ValueError for a key that is there
+    twice.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"{key[:60]!r} is there twice; keep one")
+        found[key] = value
+    return found
+
+
 def _read_form_time(text: Any) -> Any:
     if isinstance(text, datetime):
         return text
     try:
-        moment = datetime.fromisoformat(str(text).strip())
+        moment = read_time(str(text))
     except ValueError as error:
         raise ValueError(
             "give a date and a time as 2026-06-21 13:00, in the plant's time zone"
@@ -304,12 +328,7 @@ class Plane(Model):
     def named(self, name: str) -> TargetPlane:
         """Convert to the model's target plane with this name."""
         return TargetPlane(
-            name=name,
-            center=np.array(self.center),
-            normal=np.array(self.normal),
-            up=np.array(self.up),
-            width=self.width,
-            height=self.height,
+            name, **self.model_dump(by_alias=False, exclude={"kind", "marks", "camera"})
         )
 
 
@@ -416,9 +435,10 @@ class FoundEffect(ReportPart):
 
 
 class MeanGain(ReportPart):
-    """A gain in accuracy, with its interval if it is known."""
+    """A mean change of accuracy with its 95 % interval."""
 
-    mean: float = Field(description="Mean over held-out photographs [1].")
+    mean: float = Field(description="Mean change of accuracy [1].")
+    ci95: tuple[float, float] = Field(description="Its 95 % interval [1].")
 
 
 class TriedEffect(ReportPart):
@@ -444,6 +464,69 @@ class Residual(ReportPart):
     )
 
 
+class PerCovariate(ReportPart):
+    """What a coefficient is proportional to: a covariate less its center."""
+
+    covariate: str = Field(description="Name of the covariate.")
+    unit: str = Field(description="Unit of the covariate.")
+    center: float = Field(description="Value at which the coefficient changes nothing [`unit`].")
+    limits: tuple[float, float] | None = Field(
+        default=None,
+        description="What photographs covered; beyond, it counts as the limit [`unit`].",
+    )
+
+
+class DiscrepancyCoefficient(ReportPart):
+    """A signed coefficient of a correction, with its 95 % interval."""
+
+    kind: str = Field(description="Kind of the term that it belongs to.")
+    name: str = Field(description="Component of that kind.")
+    of: str | None = Field(default=None, description="Heliostat or target; null: of all.")
+    unit: str = Field(description="Unit of value and interval.")
+    value: float = Field(description="[`unit`, and per unit of the covariate]")
+    ci95: tuple[float, float] = Field(description="Its 95 % interval [`unit`].")
+    per: PerCovariate | None = Field(default=None, description="null: it is constant.")
+
+
+class TransferOut(ReportPart):
+    """Accuracy on photographs of a group that no fit saw."""
+
+    before: float = Field(description="By the declared model [1].")
+    after: float = Field(description="By a correction that was fitted to the other groups [1].")
+
+
+class RivalOut(ReportPart):
+    """Another correction that gains nearly as much."""
+
+    in_words: str = Field(description="What it is.")
+    gain_share: float = Field(description="Its gain, as a share of the first term's [1].")
+    distinguished_by: str = Field(description="Photographs in which the two differ.")
+
+
+class DiscrepancyOut(ReportPart):
+    """A correction of forecasts that no effect of the catalogue describes; it is not a cause."""
+
+    lives_in: Place | None = Field(
+        description="Where it acts; null: terms of one place leave too much."
+    )
+    scaling: str = Field(description="Covariate of its first term; constant: none.")
+    owner: Literal["all", "heliostat", "camera", "target"] = Field(
+        description="What has separate coefficients in its first term."
+    )
+    explained_share: float = Field(description="Share of the error beyond noise it removes [1].")
+    accuracy_after: float = Field(description="Mean accuracy of held-out photographs [1].")
+    per_image: dict[str, float] = Field(default={}, description="Accuracy of each of them [1].")
+    accuracy_gain: MeanGain = Field(description="Its gain on them.")
+    transfer: dict[str, TransferOut | None] = Field(
+        description="By heliostats, days and targets; null where it cannot be tested."
+    )
+    rival: RivalOut | None = Field(
+        default=None, description="null: no other term gains half as much as the first."
+    )
+    coefficients: list[DiscrepancyCoefficient] = Field(description="Of all terms, in their order.")
+    in_words: str = Field(description="All that in sentences.")
+
+
 class StudyReport(ReportPart):
     """The result of a study, also of `heliotwin study`. Optional parts have defaults."""
 
@@ -458,6 +541,15 @@ class StudyReport(ReportPart):
     unexplained_share: float = Field(
         description="Share of the error beyond the noise that is left [1]."
     )
+    partly: list[str] = Field(
+        default=[],
+        description=(
+            "Effects that gain, but leave too much to be the cause; they cannot be adopted."
+        ),
+    )
+    discrepancy: DiscrepancyOut | None = Field(
+        default=None, description="What has no name: a correction with a place and a scaling."
+    )
     skipped: dict[str, str] = Field(default={}, description="What was left out, with the reasons.")
     effects: list[FoundEffect] = Field(
         description=(
@@ -469,6 +561,11 @@ class StudyReport(ReportPart):
         description="Every effect tried by itself, the best first."
     )
     residual: Residual = Field(default=Residual(), description="What is left.")
+
+    @property
+    def accuracies(self) -> dict[str, float]:
+        """Accuracies of held-out photographs with what would be adopted."""
+        return self.after.per_image if self.discrepancy is None else self.discrepancy.per_image
 
 
 class PredictedErrorOut(BaseModel):

@@ -36,7 +36,7 @@ def no_progress(_name: str) -> None:
 
 
 @dataclass(eq=False)
-class Steps:
+class NamedSteps:
     """Convert step names to shares of ``total`` steps; ``phase`` describes the units."""
 
     total: int

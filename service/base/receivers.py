@@ -3,11 +3,12 @@
 A document has the ``kind`` and the fields of one of the classes here, in REST's names.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, TypeAdapter, model_validator
+from numpy.typing import ArrayLike
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from model.errors import InvalidInputError
 from model.plant import MIN_OPENING_DEG, Cylinder, Receiver, TargetPlane, require_cylinder_shape
@@ -17,8 +18,10 @@ from service.base.fields import Direction, Extent, JsonObject, Model, Number, Pl
 AnyReceiver = Cylinder | TargetPlane | Panels | Cavity
 """Receivers that can be stored."""
 
-RECEIVER_KINDS = ("plane", "cylinder", "panels", "cavity")
-"""Kinds of `AnyReceiver`."""
+NAMES_WITH_UNITS = {
+    name: f"{name}_m" for name in ("center", "width", "height", "radius", "aperture")
+}
+"""Fields as ``plant.yaml`` and the audit trail name them, where the unit is missing."""
 
 MAX_PANELS = 64
 """Most panels of a receiver, and most corners of an aperture."""
@@ -37,10 +40,6 @@ class PlaneReceiverIn(Plane):
 
     kind: Literal["plane"] = KIND
     absorptance: Number = ABSORPTANCE
-
-    def named(self, name: str) -> TargetPlane:
-        """Convert to the model's plane with this name."""
-        return _plane(name, self.model_dump(), self.absorptance)
 
 
 class _ReceiverPart(Model):
@@ -131,52 +130,36 @@ ReceiverIn = Annotated[
 ]
 """A receiver of any kind."""
 
-RECEIVER: TypeAdapter[PlaneReceiverIn | CylinderIn | PanelsIn | CavityIn] = TypeAdapter(ReceiverIn)
-"""Validates the document of a receiver."""
-
 
 # --- to and from the model
 # --------------------------------------------------------------------------------------------------
 
+_MODELS: Mapping[str, type[AnyReceiver]] = {
+    "plane": TargetPlane,
+    "cylinder": Cylinder,
+    "panels": Panels,
+    "cavity": Cavity,
+}
+"""The model's receiver by kind; its attributes have the names of the document's fields."""
 
-def _plane(name: str, document: JsonObject, absorptance: float = 1.0) -> TargetPlane:
-    center, normal, up = (np.array(document[key]) for key in ("center", "normal", "up"))
-    return TargetPlane(name, center, normal, up, document["width"], document["height"], absorptance)
-
-
-def _cylinder(name: str, document: JsonObject) -> Cylinder:
-    center, normal, up = (np.array(document[key]) for key in ("center", "normal", "up"))
-    sizes = (document[key] for key in ("radius", "height", "opening_deg", "absorptance"))
-    return Cylinder(name, center, normal, up, *sizes)
-
-
-def _several(name: str, document: JsonObject) -> tuple[TargetPlane, ...]:
-    return tuple(
-        _plane(f"{name}-{number}", panel, document["absorptance"])
-        for number, panel in enumerate(document["panels"], start=1)
-    )
-
-
-def _panels(name: str, document: JsonObject) -> Panels:
-    return Panels(name, _several(name, document), document["absorptance"])
-
-
-def _cavity(name: str, document: JsonObject) -> Cavity:
-    aperture = np.array(document["aperture"])
-    return Cavity(name, _several(name, document), document["absorptance"], aperture=aperture)
-
-
-_MAKERS: Mapping[str, Callable[[str, JsonObject], AnyReceiver]] = {
-    "plane": lambda name, document: _plane(name, document, document["absorptance"]),
-    "cylinder": _cylinder,
-    "panels": _panels,
-    "cavity": _cavity,
+_SCHEMAS: Mapping[str, type[Model]] = {
+    "plane": PlaneReceiverIn,
+    "cylinder": CylinderIn,
+    "panels": PanelsIn,
+    "cavity": CavityIn,
 }
 
 
 def receiver_from_json(name: str, document: JsonObject) -> AnyReceiver:
     """The model's receiver of a document that was validated when it was stored."""
-    return _MAKERS[document["kind"]](name, document)
+    values = {key: value for key, value in document.items() if key != "kind"}
+    if "panels" in values:
+        absorptance = values["absorptance"]
+        values["panels"] = tuple(
+            TargetPlane(f"{name}-{number}", **panel, absorptance=absorptance)
+            for number, panel in enumerate(values["panels"], start=1)
+        )
+    return _MODELS[document["kind"]](name, **values)
 
 
 def receiver_to_json(receiver: Receiver) -> JsonObject:
@@ -187,26 +170,27 @@ def receiver_to_json(receiver: Receiver) -> JsonObject:
     InvalidInputError
         If its kind cannot be stored.
     """
-    given = {"absorptance": float(receiver.absorptance)}
-    if isinstance(receiver, TargetPlane):
-        return {"kind": "plane", **_rectangle(receiver), **given}
-    if isinstance(receiver, Cylinder):
-        sizes = {key: float(getattr(receiver, key)) for key in ("radius", "height", "opening_deg")}
-        return {"kind": "cylinder", **_frame(receiver), **sizes, **given}
-    if isinstance(receiver, Panels):
-        return {"kind": "panels", "panels": [*map(_rectangle, receiver.panels)], **given}
-    if isinstance(receiver, Cavity):
-        opening = {"aperture": receiver.aperture.tolist()}
-        return {"kind": "cavity", **opening, "panels": [*map(_rectangle, receiver.panels)], **given}
-    raise InvalidInputError(
-        f"receiver {receiver.name}: {type(receiver).__name__} is none of"
-        f" {', '.join(RECEIVER_KINDS)}, which can be stored"
-    )
+    kind = next((kind for kind, made in _MODELS.items() if type(receiver) is made), None)
+    if kind is None:
+        raise InvalidInputError(
+            f"receiver {receiver.name}: {type(receiver).__name__} is none of"
+            f" {', '.join(_MODELS)}, which can be stored"
+        )
+    return {"kind": kind} | _values(_SCHEMAS[kind], receiver)
 
 
-def _frame(receiver: Receiver) -> JsonObject:
-    return {key: getattr(receiver, key).tolist() for key in ("center", "normal", "up")}
+def rectangle(plane: TargetPlane) -> JsonObject:
+    """Centre, directions and size of a plane, as `Plane` has them."""
+    return _values(Plane, plane)
 
 
-def _rectangle(plane: TargetPlane) -> JsonObject:
-    return {**_frame(plane), "width": float(plane.width), "height": float(plane.height)}
+def _values(schema: type[Model], receiver: Receiver) -> JsonObject:
+    values = {name: getattr(receiver, name) for name in schema.model_fields if name != "kind"}
+    return {
+        name: [rectangle(panel) for panel in value] if name == "panels" else _json(value)
+        for name, value in values.items()
+    }
+
+
+def _json(value: ArrayLike) -> Any:
+    return np.asarray(value, dtype=np.float64).tolist()

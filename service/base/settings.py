@@ -2,6 +2,7 @@
 
 import ipaddress
 import math
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,6 +145,9 @@ class StorageSettings(_SettingsGroup):
     all processes."""
     networks_dir: Path | None = None
     """Folder of the networks of heliostat types; without it networks inside data_dir."""
+    effects_from: tuple[Path, ...] = ()
+    """JSON: files of effects that the plant wrote, such as ["/etc/heliotwin/own.py"]. They are
+    code that the service runs: name only those that you have read."""
     migrate_on_start: bool | None = None
     """Bring the schema to its newest version at start; without it only SQLite is migrated."""
 
@@ -182,6 +186,13 @@ class StorageSettings(_SettingsGroup):
         url = make_url(self.database_url)
         url = url.set(drivername=_DRIVERS[url.get_backend_name()])
         return url if self.password is None else url.set(password=self.password.get_secret_value())
+
+    @property
+    def store(self) -> str:
+        """The setting that names this store from any folder, without secrets."""
+        if self.database_url is None:
+            return f"HELIOTWIN_DATA_DIR={shlex.quote(str(self.data_dir.absolute()))}"
+        return f"HELIOTWIN_DATABASE_URL={shlex.quote(_redact(self.database_url))}"
 
     @property
     def uploads_dir(self) -> Path:
@@ -372,9 +383,9 @@ class DisplaySettings(_SettingsGroup):
     time_zone: str | None = None
     """The plant's zone, as `Europe/Berlin`: pages show times in it and in UTC."""
     map_scales: dict[str, tuple[float, float]] = Field(default_factory=dict, validate_default=True)
-    """JSON: what is fine and what is poor, which is where the map's colours begin and end, of
-    accuracy [%], deviation_mm, uncertainty_mm, misfit [%], age_days, pointing_error_mrad and
-    sun_span_deg, such as {"accuracy": [95, 80]}."""
+    """JSON: what is fine and what is poor, which the map marks on its colours, of accuracy [%],
+    deviation_mm, uncertainty_mm, misfit [%], age_days, pointing_error_mrad and sun_span_deg, such
+    as {"accuracy": [95, 80]}. The colours span the field's values, up to what is poor."""
     figure_scales: dict[str, float] = Field(default_factory=dict, validate_default=True)
     """JSON: where the colours of maps end, on all pages alike, of heights, height_change and
     height_std [mm], flux_difference and mean_difference [share of the measured peak], such as

@@ -26,6 +26,7 @@ ERROR_MESSAGES: Mapping[str, str] = {
     "string_unicode": "must be text of valid Unicode",
     "bytes_type": 'must be text, ".."',
     "json_type": "must be JSON as text",
+    "bool_type": "must be true or false",
     "recursion_loop": _DEEP,
     "recursion_depth_exceeded": _DEEP,
     "is_instance_of": _OTHERWISE,
@@ -42,6 +43,12 @@ ERROR_MESSAGES: Mapping[str, str] = {
 _SUBJECT = re.compile("^[A-Z][a-z]+ should ")
 
 
+def not_a_number(value: object) -> str:
+    """The message that a JSON value is no number."""
+    kind = {str: "the string ", bool: ""}.get(type(value))
+    return "must be a number" + ("" if kind is None else f", not {kind}{json.dumps(value)[:40]}")
+
+
 def message_of(entry: Mapping[str, Any]) -> str:
     """The message of an entry of `ValidationError.errors`."""
     kind, context = entry["type"], entry.get("ctx", {})
@@ -51,7 +58,11 @@ def message_of(entry: Mapping[str, Any]) -> str:
         return not_json(_place(entry))
     if kind == "string_pattern_mismatch":
         return f"must be {FORMS.get(context['pattern']) or 'text that fits ' + context['pattern']}"
+    if kind in ("float_type", "int_type"):
+        return not_a_number(entry["input"])
     own = _SUBJECT.sub("must ", entry["msg"])
+    own = re.sub("less than or equal to (.+)", r"\1 or less", own)
+    own = re.sub("greater than or equal to (.+)", r"\1 or more", own)
     return ERROR_MESSAGES.get(kind, own if own.startswith("must ") else _OTHERWISE)
 
 

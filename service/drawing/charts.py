@@ -70,7 +70,7 @@ matplotlib.colormaps.register(matplotlib.colormaps[CONDITION].reversed(f"{CONDIT
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColourScale:
     """Colour scale: a colour map of matplotlib between two numbers."""
 
     colours: str
@@ -107,17 +107,46 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
-class HeatMap:
-    """A coloured map of a rectangle.
+class PlanePicture:
+    """A picture of a rectangle, seen straight on.
 
     Attributes
     ----------
     title : str
         Also the text alternative of the picture.
     picture : str
-        The map as a data URL.
+        Its URL.
     width, height : float [m]
         Size of the rectangle.
+    """
+
+    title: str
+    picture: str
+    width: float
+    height: float
+
+    @property
+    def _low(self) -> Array:
+        """The lower left corner (2,) [m]; the origin is the rectangle's centre."""
+        return np.array([-self.width, -self.height]) / 2
+
+    @property
+    def x_ticks(self) -> tuple[Tick, ...]:
+        """Ticks to the right [m]."""
+        return ticks(float(self._low[0]), float(self._low[0]) + self.width)
+
+    @property
+    def y_ticks(self) -> tuple[Tick, ...]:
+        """Ticks upwards [m]."""
+        return ticks(float(self._low[1]), float(self._low[1]) + self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap(PlanePicture):
+    """A coloured map of a rectangle, whose picture is a data URL.
+
+    Attributes
+    ----------
     scale : Scale
     values : (rows, columns)
         Data of the map, rows from the top.
@@ -131,11 +160,7 @@ class HeatMap:
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
 
-    title: str
-    picture: str
-    width: float
-    height: float
-    scale: Scale
+    scale: ColourScale
     values: Array = field(repr=False)
     outline: str = ""
     facets: FacetPlaces | None = None
@@ -151,10 +176,7 @@ class HeatMap:
 
     @property
     def _low(self) -> Array:
-        """The lower left corner (2,) [m]; without facets, the origin is the rectangle's centre."""
-        if self.facets is None:
-            return np.array([-self.width, -self.height]) / 2
-        return np.asarray(self.facets.box[0])
+        return super()._low if self.facets is None else np.asarray(self.facets.box[0])
 
     @property
     def beyond(self) -> tuple[float, float] | None:
@@ -182,23 +204,13 @@ class HeatMap:
             self.values, size, self.title, scale.colours, bounds, scale.label, self.facets
         )
 
-    @property
-    def x_ticks(self) -> tuple[Tick, ...]:
-        """Ticks to the right [m]."""
-        return ticks(float(self._low[0]), float(self._low[0]) + self.width)
-
-    @property
-    def y_ticks(self) -> tuple[Tick, ...]:
-        """Ticks upwards [m]."""
-        return ticks(float(self._low[1]), float(self._low[1]) + self.height)
-
 
 def _data_url(pixels: NDArray[np.uint8]) -> str:
     encoded = cv2.imencode(".png", pixels[..., [2, 1, 0, 3]])[1]
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
-def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale) -> HeatMap:
+def heat_map(title: str, values: Array, size: tuple[float, float], scale: ColourScale) -> HeatMap:
     """A map of ``values`` (rows from the top, columns).
 
     ``size`` is its width and height [m].
@@ -206,14 +218,14 @@ def heat_map(title: str, values: Array, size: tuple[float, float], scale: Scale)
     return HeatMap(title, _data_url(scale.pixels(values)), *size, scale, values)
 
 
-def flux_scale(top: float, unit: str) -> Scale:
+def flux_scale(top: float, unit: str) -> ColourScale:
     """Scale of flux: dark at zero."""
-    return Scale("inferno", 0.0, max(top, 1e-9), unit)
+    return ColourScale("inferno", 0.0, max(top, 1e-9), unit)
 
 
-def difference_scale(bound: float, unit: str) -> Scale:
+def difference_scale(bound: float, unit: str) -> ColourScale:
     """Scale of forecast minus photograph: white at zero, red if the forecast is brighter."""
-    return Scale("RdBu_r", -bound, bound, unit)
+    return ColourScale("RdBu_r", -bound, bound, unit)
 
 
 def flux_map(
@@ -247,24 +259,7 @@ def outlined(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
 # Pixels of an overlay for each pixel of its map.
 _FINE = 8
 
-_RED, _WHITE, _BLACK = (230, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 255)
-
-
-def limit_map(title: str, flux: Array, size: tuple[float, float], top: float) -> HeatMap:
-    """A map [kW/m2] in colours without red, for `marked`; its scale ends at ``top``."""
-    return heat_map(
-        title, flux, size, Scale("viridis", 0.0, max(top, 1e-9), "kW/m\N{SUPERSCRIPT TWO}")
-    )
-
-
-def marked(drawn: HeatMap, mask: NDArray[np.bool_]) -> HeatMap:
-    """A map with a region in red, if it is not empty; ``mask`` is (rows, columns)."""
-    if not mask.any():
-        return drawn
-    pixels = np.zeros((*mask.shape, 4), np.uint8)
-    pixels[mask] = _RED
-    fine = pixels.repeat(_FINE, axis=0).repeat(_FINE, axis=1)
-    return replace(drawn, outline=_data_url(fine))
+_WHITE, _BLACK = (255, 255, 255, 255), (0, 0, 0, 255)
 
 
 def dotted(drawn: HeatMap, places: Array) -> HeatMap:
@@ -286,7 +281,7 @@ def difference_map(
     return heat_map(title, difference, size, difference_scale(bound, unit))
 
 
-def _mirror_map(title: str, control: Array, places: FacetPlaces, scale: Scale) -> HeatMap:
+def _mirror_map(title: str, control: Array, places: FacetPlaces, scale: ColourScale) -> HeatMap:
     """Control heights (F, 8, 8) [m] in mm on the facets of a mirror, seen from the front."""
     heights, (low, high) = mirror_heights(control), places.box
     width, height = (high - low).tolist()
@@ -299,7 +294,7 @@ def surface_map(title: str, z: Array, places: FacetPlaces, bound: float) -> Heat
 
     ``bound`` [mm] is the end of the scale on both sides.
     """
-    return _mirror_map(title, z, places, Scale("RdBu_r", -bound, bound, "mm"))
+    return _mirror_map(title, z, places, ColourScale("RdBu_r", -bound, bound, "mm"))
 
 
 def uncertainty_map(title: str, z_std: Array, places: FacetPlaces, top: float) -> HeatMap:
@@ -307,7 +302,7 @@ def uncertainty_map(title: str, z_std: Array, places: FacetPlaces, top: float) -
 
     ``top`` [mm] is the end of the scale.
     """
-    return _mirror_map(title, z_std, places, Scale("viridis_r", 0.0, top, "mm"))
+    return _mirror_map(title, z_std, places, ColourScale("viridis_r", 0.0, top, "mm"))
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,13 @@ class FacetPlaces:
         )
 
     @classmethod
+    def of_control_points(cls, points: Array) -> "FacetPlaces":
+        """The facets of control points (F, I, J, 3) [m], as parallelograms between corners."""
+        corners = points[:, [0, -1, 0], [0, 0, -1], :2]
+        halves = (corners[:, 1:] - corners[:, :1]) / 2
+        return cls(corners[:, 0] + halves.sum(axis=1), halves, [_SQUARE] * len(points))
+
+    @classmethod
     def in_rows(cls, count: int, size: tuple[float, float]) -> "FacetPlaces":
         """Equal facets in rows from the upper left, on a mirror of (width, height) [m].
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -55,6 +56,21 @@ def map_picture(
     ratio = np.shape(values)[0] / np.shape(values)[1] if size is None else size[1] / size[0]
     figure = Figure(figsize=(6, float(np.clip(4.4 * ratio + 0.8, 2.6, 5))), layout="constrained")
     axes = figure.subplots()
+    draw_map(axes, values, size, colours, bounds, label, facets)
+    axes.set_title(title, wrap=True)
+    return png(figure)
+
+
+def draw_map(
+    axes: Axes,
+    values: NDArray[np.floating],
+    size: tuple[float, float] | None,
+    colours: str,
+    bounds: tuple[float, float | None],
+    label: str,
+    facets: FacetPlaces | None = None,
+) -> None:
+    """Draw the map of `map_picture` with its colour bar into axes of matplotlib."""
     extent = None if size is None else (-size[0] / 2, size[0] / 2, -size[1] / 2, size[1] / 2)
     if facets is not None:
         (left, bottom), (right, top) = facets.box.tolist()
@@ -64,9 +80,7 @@ def map_picture(
     low, high = bounds[0], float(np.nanmax(values)) if bounds[1] is None else bounds[1]
     image = axes.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, aspect="equal")
     axes.set(xlabel="right [m]" if size else "column", ylabel="up [m]" if size else "row")
-    axes.set_title(title, wrap=True)
-    figure.colorbar(image, ax=axes, label=label, extend=_extend(values, low, high))
-    return png(figure)
+    axes.figure.colorbar(image, ax=axes, label=label, extend=_extend(values, low, high))
 
 
 def places_picture(
@@ -81,7 +95,19 @@ def places_picture(
     Values that are not finite are hollow dots.
     """
     figure = Figure(figsize=(7, 7), layout="constrained")
-    axes = figure.subplots()
+    draw_places(figure.subplots(), places, values, colours, bounds, title)
+    return png(figure)
+
+
+def draw_places(
+    axes: Axes,
+    places: NDArray[np.floating],
+    values: NDArray[np.floating],
+    colours: str,
+    bounds: tuple[float, float],
+    label: str,
+) -> None:
+    """Draw the dots of `places_picture` into axes, with a colour bar if a value is known."""
     known, (east, north) = np.isfinite(values), places.T
     axes.scatter(east[~known], north[~known], s=14, facecolors="none", edgecolors="gray")
     low, high = bounds
@@ -89,8 +115,8 @@ def places_picture(
         east[known], north[known], s=14, c=values[known], cmap=colours, vmin=low, vmax=high
     )
     axes.set(xlabel="east of the tower [m]", ylabel="north [m]", aspect="equal")
-    figure.colorbar(shown, ax=axes, label=title)
-    return png(figure)
+    if known.any():
+        axes.figure.colorbar(shown, ax=axes, label=label)
 
 
 def series_picture(

@@ -67,11 +67,11 @@ def _draw_side(
     tower: Tower | None,
 ) -> None:
     """Tower, receivers and targets as seen from the north: east is left."""
-    if tower is not None:
-        corner, width = (-tower.radius, 0.0), 2 * tower.radius
-        axes.add_patch(
-            matplotlib.patches.Rectangle(corner, width, tower.height, color=_TOWER, alpha=0.5)
-        )
+    if tower is None:
+        axes.plot([0, 0], [0, 1], ":", color=_TOWER, transform=axes.get_xaxis_transform())
+        axes.annotate("no tower in the file", (0, 0), (8, 8), textcoords="offset points")
+    else:
+        axes.fill_between([-tower.radius, tower.radius], tower.height, color=_TOWER, alpha=0.5)
     for surfaces, colour in ((receivers, _RECEIVER), (plant.targets, _TARGET)):
         for name, surface in surfaces.items():
             lines = surface_lines(surface)

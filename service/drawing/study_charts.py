@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from model.covariates import RECORDED_TIME, covariates_of
 from model.study import FluxImage, Study
-from model.study.covariates import covariates_of
 from model.study.judging import rank_correlation
 from service.drawing.charts import (
+    ColourScale,
     HeatMap,
-    Scale,
     Tick,
     difference_scale,
     flux_scale,
@@ -84,8 +84,8 @@ class Pictures:
 
     rows: list[Row]
     window: float
-    flux: Scale
-    residual: Scale
+    flux: ColourScale
+    residual: ColourScale
     beyond: float | None
 
 
@@ -161,9 +161,11 @@ class Scatter:
 
 def scatters(study: Study) -> list[Scatter]:
     """Error of all held-out images against each of `DRAWN`."""
-    known = covariates_of(study.images, study.site)
+    known = covariates_of([p.setup for p in study.images], study.site)
     return [
-        _scatter(study, f"{c.name} [{c.unit}]", values)
+        _scatter(study, "recorded time [days since the first]", values - values.min())
+        if c is RECORDED_TIME
+        else _scatter(study, f"{c.name} [{c.unit}]", values)
         for c, values in known.items()
         if c.name in DRAWN
     ]

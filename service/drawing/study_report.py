@@ -4,13 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
 from model.effects import CATALOGUE, Parameter
 from model.study import Study, conclude
 from model.study.advice import photographs_to_distinguish
 from model.study.outcome import Found
-from service.drawing.charts import difference_map
+from service.drawing.charts import Array, HeatMap, difference_map
+from service.drawing.discrepancy_chart import amount_charts
 from service.drawing.study_charts import accuracy_chart, pictures, scatters
 from service.drawing.templates import ASSETS, TEMPLATES
 
@@ -136,12 +138,17 @@ def study_body(
     chart, sides = accuracy_chart(study), (study.window, study.window)
     mean = "Mean of forecast minus photograph"
     left = difference_map(mean, study.residual_map(), sides, "of peak", ends["mean_difference"])
+    found = study.discrepancy
+    discrepancy = None if found is None else found.to_json()
     return TEMPLATES.get_template("study.html").render(
         study=study,
         conclusion=conclude(study),
         title=title,
         verdict=VERDICTS[study.verdict],
         findings=[Finding.of(found) for found in study.found],
+        discrepancy=discrepancy,
+        amounts=[] if discrepancy is None else amount_charts(discrepancy["coefficients"]),
+        correction_map=None if found is None else _correction_map(found.change, sides),
         chart=chart,
         pictures=pictures(study, chart.images, ends["flux_difference"]),
         scatters=scatters(study),
@@ -150,3 +157,9 @@ def study_body(
         skipped=skipped or {},
         few=FEW,
     )
+
+
+def _correction_map(change: Array, sides: tuple[float, float]) -> HeatMap:
+    """The mean change of forecasts (64, 64) by a correction [of the measured peak]."""
+    bound = float(np.abs(change).max()) or 1.0
+    return difference_map("Mean change by the correction", change, sides, "of peak", bound)

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from importlib.resources import files
 from typing import Any, Self
 from urllib.parse import quote
@@ -90,18 +91,41 @@ def times_in_zone(text: str, zone: str = "UTC") -> str:
     )
 
 
-def power(watts: float) -> Quantity:
-    """A power in W, or in kW from 1000 W."""
-    text = figure(watts / 1e3, 2, "kW") if abs(watts) >= 1000 else figure(watts, 0, "W")
-    return Quantity(text, float(watts), "W")
+_PREFIXES = (("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3))
 
 
-def irradiance(watts_m2: float) -> Quantity:
-    """A flux in kW/m²; its ``value`` for tables as CSV is in W/m²."""
-    kilowatts = watts_m2 / 1e3
+def prefixed(value: float | None, unit: str) -> Quantity:
+    """A number in three figures with a prefix of its unit, such as 355 MW; whole below 1000."""
+    if value is None:
+        return figure(None, unit=unit)
+    rounded = float(f"{value:.3g}")
+    prefix, size = next((one for one in _PREFIXES if abs(rounded) >= one[1]), ("", 0.0))
+    text = _three_figures(rounded / size, prefix + unit) if size else figure(value, 0, unit)
+    return Quantity(text, float(value), unit)
+
+
+def _three_figures(value: float, unit: str) -> Quantity:
+    """With three decimals at most, and all digits from 1000 on."""
     ends = enumerate((100.0, 10.0, 1.0))
-    digits = next((n for n, least in ends if abs(kilowatts) >= least), 3) if kilowatts else 0
-    return Quantity(figure(kilowatts, digits, "kW/m²"), float(watts_m2), "W/m²")
+    rounded = abs(float(f"{value:.3g}"))
+    digits = next((n for n, least in ends if rounded >= least), 3) if value else 0
+    return figure(value, digits, unit)
+
+
+def irradiance(watts_m2: float | None) -> Quantity:
+    """A flux in kW/m²; its ``value`` for tables as CSV is in W/m²."""
+    if watts_m2 is None:
+        return figure(None, unit="W/m²")
+    return Quantity(_three_figures(watts_m2 / 1e3, "kW/m²"), float(watts_m2), "W/m²")
+
+
+def quantity(name: str, value: float) -> Quantity:
+    """A number in the unit at the end of its ``name``; shares and areas in three figures."""
+    if name.endswith("_w_m2"):
+        return irradiance(value)
+    if name.endswith("_w"):
+        return prefixed(value, "W")
+    return _three_figures(value, "m²" if name.endswith("_m2") else "")
 
 
 def lasting(seconds: float) -> str:
@@ -110,14 +134,6 @@ def lasting(seconds: float) -> str:
         if seconds >= 1.5 * length:
             return figure(seconds / length, 0, unit)
     return figure(max(seconds, 1.0), 0, "s")
-
-
-def storage(size_bytes: float) -> Quantity:
-    """A size of data, in B to TB."""
-    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size_bytes >= size:
-            return Quantity(figure(size_bytes / size, 1, unit), float(size_bytes), "B")
-    return figure(size_bytes, 0, "B")
 
 
 def in_words(value: Any) -> str:
@@ -133,10 +149,20 @@ def in_words(value: Any) -> str:
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
+CORRECTION = "correction (no cause)"
+"""What people read of an adopted discrepancy, so that nobody takes it for a cause."""
+
+
+def effect_label(name: str) -> str:
+    """The name of an effect in words."""
+    return CORRECTION if name == "correction" else name.replace("_", " ")
+
+
 def model_in_words(version: str) -> str:
     """A version of the plant's model in words; ``2:sun_shape+soiling`` is an example."""
     number, _, effects = version.partition(":")
-    names = "no effects" if effects == "none" else ", ".join(effects.replace("_", " ").split("+"))
+    named = ", ".join(map(effect_label, effects.split("+")))
+    names = "no effects" if effects == "none" else named
     return f"version {number}, {names}"
 
 
@@ -158,13 +184,15 @@ def environment(*packages: str) -> Environment:
         moment=moment,
         form_time=form_time,
         plant_times=times_in_zone,
-        power=power,
+        power=partial(prefixed, unit="W"),
+        energy=partial(prefixed, unit="Wh"),
         irradiance=irradiance,
         lasting=lasting,
-        storage=storage,
+        storage=partial(prefixed, unit="B"),
         in_words=in_words,
         model_in_words=model_in_words,
         path=lambda value: quote(value, ""),
+        effect_label=effect_label,
         words=lambda name: name.replace("_", " "),
     )
     return made

@@ -173,10 +173,11 @@ class Timeline:
 
     @cached_property
     def bounds(self) -> AxisRange:
-        """The shown values. They begin at zero, except percentages."""
+        """The shown values. They begin at zero; percentages do not, and end at 100."""
         numbers = [one.number for some in self.values.values() for one in some]
         numbers += [] if self.limit is None else [self.limit.number]
-        return _value_range(numbers, from_zero=self.unit != "%")
+        found = _value_range(numbers, from_zero=self.unit != "%")
+        return AxisRange(found.low, min(found.high, 100.0)) if self.unit == "%" else found
 
     @cached_property
     def x_ticks(self) -> TimeTicks:

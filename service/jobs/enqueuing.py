@@ -5,8 +5,9 @@ from service.jobs.kind import Kind, Kinds, Payload
 from service.jobs.uploads import delete_unused_uploads
 from service.store import audit
 from service.store.job_tables import JobRow
-from service.store.jobs.queue import Bounds, add_job, cancel, delete_plan
+from service.store.jobs.queue import QueueBounds, add_job, cancel, delete_plan
 from service.store.keys import ITSELF
+from service.store.rows import Added
 from service.twin.runtime.runtime import Runtime
 
 
@@ -16,7 +17,7 @@ def enqueue(
     payload: Payload,
     actor: str,
     idempotency_key: str | None = None,
-) -> JobRow:
+) -> Added[JobRow]:
     """Queue a job like `add_job`, audit it, and wake a worker of this process.
 
     A payload that has only one job (`Kind.existing`) gets that job.
@@ -31,15 +32,15 @@ def enqueue(
     if kind.require is not None:
         kind.require(payload, runtime)
     settings, document = runtime.settings, payload.model_dump(mode="json")
-    bounds = Bounds(settings.max_queued_jobs, settings.max_queued_jobs_of_key)
+    bounds = QueueBounds(settings.max_queued_jobs, settings.max_queued_jobs_of_key)
     is_short = (
         kind.expected_s is not None and kind.expected_s(payload, runtime) <= settings.short_job_s
     )
     with runtime.database.writing() as session:
         existing = kind.existing and kind.existing(session, payload, settings)
         if existing:
-            return existing
-        row, is_new = add_job(
+            return Added(existing, False)
+        added = row, is_new = add_job(
             session, kind.name, document, actor, idempotency_key, bounds, is_short
         )
         if is_new:
@@ -47,7 +48,7 @@ def enqueue(
             audit.record(session, actor, "job.created", f"job {row.id}", kind=kind.name)
     # A worker for short jobs only may wait, too.
     runtime.job_came.release(2 if row.is_short else 1)
-    return row
+    return added
 
 
 def enqueue_due(runtime: Runtime, kinds: Kinds) -> None:

@@ -29,6 +29,7 @@ from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs.queue import ENDED
+from service.store.plant.geometry import require_origin
 from service.twin.runtime.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
@@ -69,6 +70,8 @@ def receive_upload(runtime: Runtime, file: IO[bytes], name: str, actor: str) -> 
     ------
     InvalidInputError
         If it is no ZIP file, or has no measurement folder.
+    ConflictError
+        If it is of another plant.
     TooLargeError
         If it is too large unpacked.
     TooManyError
@@ -94,7 +97,7 @@ def receive_upload(runtime: Runtime, file: IO[bytes], name: str, actor: str) -> 
             unpack_archive(file, partial / _CONTENT, most, admit)
             upload = _load(partial)
             assert upload is not None, "it was admitted"
-            upload = upload.model_copy(update=_count(partial / _CONTENT))
+            upload = upload.model_copy(update=_count(runtime, partial / _CONTENT))
             _write_record(partial, upload)
             with runtime.database.changing() as session:
                 about = {"file": name[:200], "n_measurements": upload.n_measurements}
@@ -128,8 +131,11 @@ def _require_share(settings: Settings, upload: UploadedFolder) -> None:
         )
 
 
-def _count(path: Path) -> dict[str, int]:
-    """Count what a folder has; InvalidInputError if it is no measurement folder."""
+def _count(runtime: Runtime, path: Path) -> dict[str, int]:
+    """Count what a folder has.
+
+    InvalidInputError if it is no measurement folder, ConflictError if it is another plant's.
+    """
     try:
         with confined_to(path):
             folder = read_folder(path, whole_field=True)
@@ -137,6 +143,8 @@ def _count(path: Path) -> dict[str, int]:
             measurements = [one for name in names for one in folder.measurements(name, False)]
     except InvalidInputError as error:
         raise InvalidInputError(str(error).replace(str(path), "file")) from None
+    with runtime.database.reading() as session:
+        require_origin(session, folder.plant.name, folder.plant.origin)
     return {
         "n_heliostats": len(names),
         "n_measurements": len(measurements),

@@ -87,7 +87,7 @@ def decode_image(data: bytes, *, max_pixels: int = MAX_PIXELS) -> Pixels:
     ndarray uint8 or uint16
         (rows, columns) for a gray file and (rows, columns, 3) in RGB order for a colour file.
         The depth is that of the file's samples, up to 16 bits. Transparency is dropped. EXIF
-        orientation is ignored, because marks and configured corner pixels refer to the sensor.
+        orientation is applied: marks and corner pixels refer to the picture as viewers show it.
 
     Raises
     ------

@@ -8,6 +8,7 @@ does not read TIFF headers, because it would read all values of all tags.
 
 import io
 import os
+import re
 import resource
 import struct
 import sys
@@ -43,18 +44,24 @@ _MAX_SCANNED = 1_000_000_000
 # Rows that are converted from BGR to RGB at a time.
 _STRIP = 64
 
+# A marker that ends a scan; 0xFF00 is a byte of it, and 0xFFD0 to 0xFFD7 restart it.
+_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Fill bytes, and markers without a length.
+_BARE_MARKERS = {0xFF, 0x01, *range(0xD0, 0xD8)}
+
 _STATM = Path("/proc/self/statm")
 
 _FORMATS = ("PNG", "JPEG", "BMP")
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_NEEDED = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+_PNG_NEEDED = {b"IHDR", b"PLTE", b"eXIf", b"IDAT", b"IEND"}
 
 # Sizes [bytes] of TIFF's field types, BYTE to DOUBLE (TIFF 6.0, section 2); 0 is no type.
 _TIFF_SIZES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8])
 _TIFF_NUMBERS = {3: "u2", 4: "u4"}  # SHORT and LONG
 _TIFF_MOST_TAGS = 512
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
+_TIFF_PHOTOMETRIC, _TIFF_FORMAT, _WHITE_IS_ZERO, _UNSIGNED = 262, 339, 0, {1, 4}
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
 _TIFF_PLACES = ((273, 279), (324, 325))  # (offsets, byte counts) of strips and of tiles
 
@@ -65,6 +72,7 @@ class CheckedFile(NamedTuple):
     data: bytes
     width: int
     height: int
+    is_inverted: bool = False  # as OpenCV decodes it
 
 
 def decode(data: bytes, max_pixels: int) -> NDArray[Any]:
@@ -75,7 +83,8 @@ def decode(data: bytes, max_pixels: int) -> NDArray[Any]:
     InvalidInputError
         If the file cannot be decoded; the message gives the reason.
     """
-    checked, width, height = _container(data)(data)
+    checked = _container(data)(data)
+    _, width, height, is_inverted = checked
     if width < 1 or height < 1:
         raise InvalidInputError("image: it claims no pixels; send a photograph")
     if width * height > max_pixels:
@@ -83,7 +92,8 @@ def decode(data: bytes, max_pixels: int) -> NDArray[Any]:
             f"image: {width} x {height} pixels is more than {max_pixels} allowed; scale it down"
         )
     limit_memory(_MEMORY_BYTES + _MEMORY_PER_PIXEL * width * height)
-    return _pixels(checked, (height, width))
+    pixels = _pixels(checked.data, (height, width))
+    return ~pixels if is_inverted else pixels
 
 
 def _container(data: bytes) -> Callable[[bytes], CheckedFile]:
@@ -119,14 +129,16 @@ def _with_header(data: bytes) -> CheckedFile:
 
 
 def _pixels(data: bytes, shape: tuple[int, int]) -> NDArray[Any]:
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    # EXIF orientation is applied, as viewers and browsers do.
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         if error.code == cv2.Error.STS_NO_MEM:
             raise MemoryError from error
         image = None
-    if image is None or image.shape[:2] != shape or image.dtype not in (np.uint8, np.uint16):
+    turned = None if image is None else image.shape[:2] in (shape, shape[::-1])
+    if image is None or not turned or image.dtype not in (np.uint8, np.uint16):
         raise _truncated()
     return image
 
@@ -152,10 +164,31 @@ def _check_png(data: bytes) -> CheckedFile:
     raise _truncated()
 
 
+def _end_of_jpeg(data: bytes) -> int:
+    """Where the image ends that a JPEG begins with: behind its marker EOI (ITU-T T.81, B.1).
+
+    A second image behind it, such as those of cameras with several lenses, is other data.
+    """
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker in _BARE_MARKERS:
+            position += 1 if marker == 0xFF else 2
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4])
+        if marker == 0xDA:
+            found = _MARKER.search(data, position)
+            position = len(data) if found is None else found.start()
+        if data[position : position + 2] == b"\xff\xd9":
+            return position + 2
+    raise _truncated()
+
+
 def _check_jpeg(data: bytes) -> CheckedFile:
-    if not data.rstrip(b"\x00").endswith(b"\xff\xd9"):
-        raise _trailing() if b"\xff\xd9" in data[-(1 << 16) :] else _truncated()
-    _, width, height = checked = _with_header(data)
+    if data[_end_of_jpeg(data) :].strip(b"\x00"):
+        raise _trailing()
+    checked = _with_header(data)
+    width, height = checked.width, checked.height
     # This is an upper bound: each scan begins with these bytes. Scan data never contain them, but
     # an embedded preview may.
     scans = data.count(b"\xff\xda")
@@ -245,6 +278,16 @@ def _check_tiff(data: bytes) -> CheckedFile:
     )
     # Samples and bits multiply the memory that the decoder needs for each pixel.
     bits = numbers(_TIFF_BITS, (1, max(samples, 1)))
+    kinds = {*numbers(_TIFF_FORMAT, (1, max(samples, 1))).tolist()}
+    if not kinds <= _UNSIGNED:
+        named = "signed" if 2 in kinds else "floating-point or complex"
+        raise _unlike_a_tiff(f"of {named} samples is not supported; write unsigned integers")
+    photometric = numbers(_TIFF_PHOTOMETRIC, (1,)).tolist()
+    is_deep = bool((bits > 8).any())
+    if is_deep and not {*photometric} <= {_WHITE_IS_ZERO, 1, 2}:
+        raise _unlike_a_tiff("of more than 8 bits that is neither gray nor RGB is not supported")
+    if is_deep and (bits < 16).any():
+        raise _unlike_a_tiff("of 9 to 15 bits is not supported; write 16")
     if samples > 4 or (bits > 16).any():
         raise _unlike_a_tiff("of more than 4 samples or 16 bits is not supported")
     if tile_width > 4096 or tile_height > 4096:
@@ -254,7 +297,7 @@ def _check_tiff(data: bytes) -> CheckedFile:
     ):
         if len(offsets) != len(counts) or (offsets + counts > len(data)).any():
             raise _truncated()
-    return CheckedFile(data, width, height)
+    return CheckedFile(data, width, height, is_deep and photometric == [_WHITE_IS_ZERO])
 
 
 def limit_memory(more: int) -> None:

@@ -24,7 +24,7 @@ from model.pointing import Weather
 from model.sunshape import SHAPES, Buie, SunShape
 from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
-from service.base.fields import JsonObject, Sun
+from service.base.fields import JsonObject, Sun, unique_keys
 from service.base.names import require_text
 from service.base.plant_facts import PlantFacts
 from service.base.receivers import AnyReceiver
@@ -37,13 +37,13 @@ from service.sources.schema import (
     CalibrationProperties,
     CylindricalReceiver,
     DeclaredOptics,
+    FocalSpots,
     HeliostatProperties,
     ItemProperties,
     KinematicsProperties,
     LinearAxis,
     PlanarTarget,
     ReceiversPart,
-    Spots,
     TowerBase,
     parse,
 )
@@ -162,7 +162,7 @@ def read_json(path: Path) -> Any:
             f"{path}: holds up to {n_values} values; at most {MAX_JSON_VALUES} are read"
         )
     try:
-        document = json.loads(data.decode("utf-8"))
+        document = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique_keys)
     except json.JSONDecodeError as error:
         raise InvalidInputError(f"{path}: {not_json(place_of(error))}") from None
     except UnicodeDecodeError:
@@ -356,7 +356,7 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
             f"{where}: target_name: {document.target_name[:80]!r} is none of"
             f" {', '.join(plant.targets)}"
         )
-    spots, motors = document.focal_spot or Spots(), document.motor_position
+    spots, motors = document.focal_spot or FocalSpots(), document.motor_position
     steps = motors and [motors.axis_1_motor_position, motors.axis_2_motor_position]
     spot = spots.HeliOS if spots.UTIS is None else spots.UTIS
     return Measurement(

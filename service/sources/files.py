@@ -76,12 +76,16 @@ def file_name(path: Path) -> str:
     return escape_control_characters(str(path))
 
 
-def read_text(path: Path, max_bytes: int) -> str:
-    """Read a text file in UTF-8; InvalidInputError names the line of a byte that is none."""
+def read_text(path: Path, max_bytes: int, otherwise: str | None = None) -> str:
+    """Read a text file in UTF-8, or in the encoding ``otherwise``; InvalidInputError names the line
+    of a byte that is none.
+    """
     data = read_file(path, max_bytes)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if otherwise is not None:
+            return data.decode(otherwise)
         line = data[: error.start].count(b"\n") + 1
         raise InvalidInputError(
             f"{file_name(path)}, line {line}: has a byte that is no UTF-8; save the file as UTF-8"

@@ -7,14 +7,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
-from model.surface import DEGREE, control_points, heights
+from model.surface import DEGREE, control_points, greville, heights
 from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
 from service.base.plant_facts import NO_FACTS, PlantFacts
@@ -25,6 +25,39 @@ from service.sources.files import read_file
 # PAINT's splines have 240 kB.
 _MAX_SPLINE_BYTES = 2**22
 _MAX_DEGREE = 7
+# Largest deviation of x(u) and y(v) from linear ones, of a facet's sides.
+_LINEAR = 1e-3
+
+
+class MeasuredSurface(NamedTuple):
+    """Control points (F, I, J, 3) [m] of a mirror in its coordinates, and the splines' degree.
+
+    ``parameters_are_positions`` is that of `model.surface.heights`.
+    """
+
+    points: Array
+    degree: int
+    parameters_are_positions: bool = False
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether x and y are linear in the parameters, so that these are positions anyway."""
+        _, rows, columns, _ = self.points.shape
+        x, y = self.points[:, :, 0, 0], self.points[:, 0, :, 1]
+        shares = ((a - a[:, :1]) / np.ptp(a, axis=1, keepdims=True) for a in (x, y))
+        return all(
+            np.abs(share - greville(count, self.degree)).max() < _LINEAR
+            for share, count in zip(shares, (rows, columns), strict=True)
+        )
+
+    def write(self, path: Path) -> None:
+        """Write it as ``H-nurbs-surface.npz``."""
+        np.savez_compressed(
+            path,
+            control_points=self.points,
+            degrees=np.full(2, self.degree),
+            parameters_are_positions=np.array(int(self.parameters_are_positions)),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +111,8 @@ class MeasurementFolder(ABC):
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
         """Iterate over all measurements of a heliostat by identifier, with their image files."""
 
-    def measured_surface(self, heliostat: str) -> tuple[Array, int] | None:
-        """Control points (F, I, J, 3) [m] and degree of a measured surface, or None.
-
-        The points are in mirror coordinates. By default they are read from the paths of PAINT's
+    def measured_surface(self, heliostat: str) -> MeasuredSurface | None:
+        """The measured surface of a heliostat, or None; by default from the paths of PAINT's
         layout.
         """
         return read_surface(self.root, self.plant.heliostats[heliostat])
@@ -106,11 +137,15 @@ def read_height_std(root: Path, heliostat: Heliostat) -> Array | None:
     return std
 
 
-def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
-    """Control points (F, I, J, 3) [m] and spline degree from ``root/H/Deflectometry``, or None.
+def read_surface(root: Path, heliostat: Heliostat) -> MeasuredSurface | None:
+    """The measured surface from ``root/H/Deflectometry``, or None.
 
     ``H-nurbs-surface.npz`` comes first, then PAINT's ``*deflectometry.h5``, then any ``*.h5`` of
     PAINT or SOFAST; of several files the first by name.
+
+    A spline is its geometry. If the file has the measured ``normals`` too, it is ARTIST's fit of
+    deflectometry, whose parameters are positions. A number ``parameters_are_positions``, 0 or 1,
+    in the file says it otherwise.
     """
     folder = root / heliostat.name / "Deflectometry"
     spline = folder / f"{heliostat.name}-nurbs-surface.npz"
@@ -133,11 +168,20 @@ def read_surface(root: Path, heliostat: Heliostat) -> tuple[Array, int] | None:
             raise InvalidInputError(
                 f"{spline}: 'degrees' must be 1 to {_MAX_DEGREE}, and less than there are points"
             )
-        return points, degree
+        declared = data.get("parameters_are_positions", np.array(int("normals" in data)))
+        if declared.size != 1 or declared.item() not in (0, 1):
+            raise InvalidInputError(f"{spline}: 'parameters_are_positions' must be 0 or 1")
+        found = MeasuredSurface(points, degree, bool(declared.item()))
+        if found.parameters_are_positions and not found.is_linear:
+            shape = tuple(max(n, DEGREE + 1) for n in points.shape[1:3])
+            z = heights(heliostat, *found, shape=shape)
+            return MeasuredSurface(control_points(heliostat, z), DEGREE)
+        return found
     files = sorted(folder.glob("*deflectometry.h5")) or sorted(folder.glob("*.h5"))
     if not files:
         return None
-    return control_points(heliostat, read_deflectometry(files[0], heliostat)), DEGREE
+    z = read_deflectometry(files[0], heliostat)
+    return MeasuredSurface(control_points(heliostat, z), DEGREE)
 
 
 def _degree(given: Array | None) -> int:
@@ -148,9 +192,14 @@ def _degree(given: Array | None) -> int:
     return int(first[0]) if first.size and np.isfinite(first[0]) else 0
 
 
-def measured_heights(heliostat: Heliostat, surface: tuple[Array, int]) -> Array:
+def points_of(heliostat: Heliostat, surface: MeasuredSurface | None) -> tuple[Array, int]:
+    """Control points (F, I, J, 3) [m] and spline degree; those of the ideal surface for None."""
+    return (control_points(heliostat), DEGREE) if surface is None else surface[:2]
+
+
+def measured_heights(heliostat: Heliostat, surface: MeasuredSurface) -> Array:
     """Heights z (F, 8, 8) [m] of a surface from `MeasurementFolder.measured_surface`."""
-    return heights(heliostat, surface[0], surface[1])
+    return heights(heliostat, *surface)
 
 
 @dataclass(frozen=True)

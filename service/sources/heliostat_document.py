@@ -16,11 +16,11 @@ from service.base.fields import Flag, JsonObject, Name, Number, Position
 from service.sources.plant_schema import (
     MAX_FACETS,
     Angle,
-    Arm,
     ErrorMrad,
     HeliostatEntry,
     Length,
     Reflectance,
+    Spindle,
     Steps,
 )
 from service.sources.plant_tables import MAX_CORNERS
@@ -41,19 +41,10 @@ class _Part(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
 
 
-class LinearDriveDocument(_Part):
+class LinearDriveDocument(_Part, Spindle):
     """`model.actuator.LinearActuator`."""
 
     kind: Literal["linear"] = Field("linear", description="A spindle.")
-    increment: Steps = Field(description="Steps for one metre of stroke [1/m].")
-    initial_stroke_length: Annotated[Number, Field(ge=0, le=100)] = Field(
-        description="At zero steps [m]."
-    )
-    offset: Arm = Field(description="From the axis to the spindle's fixed end [m].")
-    pivot_radius: Arm = Field(description="From the axis to the spindle's moving end [m].")
-    initial_angle: Angle = Field(description="Axis angle at zero steps [rad].")
-    clockwise: Flag = Field(description="Whether the angle decreases as the stroke increases.")
-    max_increment: Steps = Field(description="The end of travel [steps].")
 
 
 class RotaryDriveDocument(_Part):
@@ -241,8 +232,9 @@ def _drive_document(drive: Actuator) -> LinearDriveDocument | RotaryDriveDocumen
 
 
 def _actuator(drive: LinearDriveDocument | RotaryDriveDocument) -> Actuator:
-    made = LinearActuator if isinstance(drive, LinearDriveDocument) else RotaryActuator
-    return made(**drive.model_dump(exclude={"kind"}))
+    if isinstance(drive, LinearDriveDocument):
+        return drive.actuator()
+    return RotaryActuator(**drive.model_dump(exclude={"kind"}))
 
 
 def heliostat_from_json(name: str, properties: Any) -> Heliostat:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pydantic import Field
 
 from model.errors import InvalidInputError
-from service.base.fields import JsonObject, Metres
+from service.base.fields import JsonObject
 from service.base.receivers import AnyReceiver
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import place_heliostat
@@ -13,10 +13,8 @@ from service.sources.plant_schema import (
     CantingChoice,
     FacetsEntry,
     HeliostatEntry,
+    HeliostatPlace,
     HeliostatTypeEntry,
-    Length,
-    NumberedName,
-    PlantPart,
     TypeChoice,
     nearest,
 )
@@ -24,19 +22,12 @@ from service.sources.plant_tables import PlacedHeliostat
 from service.sources.plant_types import type_of_entry
 
 
-class HeliostatOfType(PlantPart):
+class HeliostatOfType(HeliostatPlace):
     """A heliostat of any type, as of ``plant.yaml``."""
 
     type: TypeChoice = Field(
         description="Name of a heliostat type of the imported plant.yaml, or a type written out."
     )
-    east_m: Metres = Field(description="Of the pylon's foot from the tower base [m].")
-    north_m: Metres = Field(description="Of the pylon's foot from the tower base [m].")
-    up_m: Metres = Field(description="Of the pylon's foot above the tower base [m].")
-    receiver: NumberedName | None = Field(
-        None, description="The receiver or target that it is canted to; without it the first."
-    )
-    focal_length_m: Length | None = Field(None, description="In place of its slant range [m].")
     facets: FacetsEntry | None = Field(None, description="In place of the type's facets.")
     canting: CantingChoice | None = Field(None, description="In place of the type's canting.")
 
@@ -58,16 +49,10 @@ def document_of(
     own = {key: getattr(given, key) for key in ("facets", "canting") if getattr(given, key)}
     entry = _entry(given.type, known["types"]).model_copy(update=own)
     label = given.type if isinstance(given.type, str) and not own else ""
-    placed = HeliostatEntry.model_construct(
-        name=name,
-        # A mirror that differs from its type is of none.
-        type=label,
-        east_m=given.east_m,
-        north_m=given.north_m,
-        up_m=given.up_m,
-        receiver=_goal(given.receiver, goals),
-        focal_length_m=given.focal_length_m,
-    )
+    place = {key: getattr(given, key) for key in HeliostatPlace.model_fields}
+    # A mirror that differs from its type is of none.
+    named = {"name": name, "type": label, "receiver": _goal(given.receiver, goals)}
+    placed = HeliostatEntry.model_construct(**place | named)
     heliostat = place_heliostat(
         PlacedHeliostat("east_m, north_m, up_m", placed),
         type_of_entry(label or name, entry, known["files"]),

@@ -8,7 +8,13 @@ pair together locate either target. A separate target has four brackets.
 from model.imaging.rectify import BRACKETS, Layout, MarkPlace
 
 CENTERED_WINDOW = 6.1
-"""Side [m] of PAINT's ``flux-centered`` images, which are centered on the centroid."""
+"""Side [m] of PAINT's ``flux-centered`` images, which are centered on the centroid.
+
+Of 20 images that also have the whole target, the side that agrees best is 6.095 to 6.101 m.
+"""
+
+CENTERED_SIZE_ERROR = 0.01
+"""Standard deviation [1] of that side, as it is not documented: a nuisance of refinement."""
 
 _UPPER: Layout = (
     MarkPlace("L", 0, 0, 0),

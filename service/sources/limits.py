@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from service.sources.plant_formats.text import ForeignLine, read_lines
-from service.sources.plant_tables import to_number
+from service.sources.text_lines import ForeignLine, read_csv, to_number
 
 Array = NDArray[np.float64]
 
@@ -73,7 +72,7 @@ def _limit_map(file: Path) -> Array:
     """Limits (r, c) [kW/m2] of a file."""
     if not file.is_file():
         raise InvalidInputError(f"--limit: {str(file)[:60]!r} is neither a number nor a file")
-    lines = read_lines(file, ",")
+    lines = read_csv(file)
     for line in lines:
         if len(line.cells) != len(lines[0].cells):
             raise line.refuse(f"has {len(line.cells)} limits, and the first {len(lines[0].cells)}")
@@ -89,7 +88,7 @@ def _limit_map(file: Path) -> Array:
 
 def _flow_path(file: Path) -> Array:
     """Positions and shares (n, 2) of a file, whose first line may name them."""
-    lines = read_lines(file, ",")
+    lines = read_csv(file)
     if lines and math.isnan(to_number(lines[0].cells[0].strip())):
         lines = lines[1:]
     path = np.array([[line.number(0, 0, 1), line.number(1, _LEAST, 1)] for line in lines])

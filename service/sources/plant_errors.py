@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -29,7 +30,7 @@ _OTHER_FORMS = {
 _MESSAGES: Mapping[str, str] = {
     "missing": "is missing; add it",
     "string_type": "must be text",
-    "bool_type": "must be true or false",
+    **dict.fromkeys(("float_type", "int_type"), "must be a number"),
     "list_type": "must be a list, [..]",
     "tuple_type": "must be a list, [..]",
     "dict_type": "must be lines of key: value",
@@ -38,15 +39,42 @@ _MESSAGES: Mapping[str, str] = {
 }
 
 
+_MOST_MISTAKES = 50
+
+
+class Mistakes:
+    """Collects mistakes, to name all of them in one error."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    @contextmanager
+    def collected(self) -> Iterator[None]:
+        """Keep an error of the block for `require_none`."""
+        try:
+            yield
+        except InvalidInputError as error:
+            self.found.append(str(error))
+
+    def require_none(self) -> None:
+        """Raise InvalidInputError with all mistakes, one a line."""
+        if self.found:
+            more = len(self.found) - _MOST_MISTAKES
+            rest = [f"and {more} more"] if more > 0 else []
+            raise InvalidInputError("\n".join([*self.found[:_MOST_MISTAKES], *rest]))
+
+
 def parse_plant(document: YamlDocument) -> PlantDocument:
-    """Validate a plant; InvalidInputError names the line and key of the first mistake."""
+    """Validate a plant; InvalidInputError names the line and key of each mistake."""
     try:
         return PlantDocument.model_validate(document.value)
     except ValidationError as error:
-        entries = error.errors(include_url=False)
-        first = min(entries, key=lambda entry: _line(document, _path(document, entry)))
-        path = _path(document, first)
-        raise InvalidInputError(f"{document.place(path)}: {_message(first, path)}") from None
+        mistakes = Mistakes()
+        by_path = {_path(document, entry): entry for entry in error.errors(include_url=False)[::-1]}
+        for path in sorted(by_path, key=partial(_line, document)):
+            mistakes.found.append(f"{document.place(path)}: {_message(by_path[path], path)}")
+        mistakes.require_none()
+        raise
 
 
 @dataclass(frozen=True)
@@ -128,6 +156,11 @@ def _message(entry: Mapping[str, Any], path: KeyPath) -> str:
     if kind in ("literal_error", "union_tag_invalid"):
         expected = context.get("expected_tags", context.get("expected", ""))
         known = expected.replace(" or ", ", ").replace("'", "").split(", ")
+        if (path[0], path[-1], context.get("tag", value)) == ("targets", "kind", "cylinder"):
+            return (
+                "'cylinder' is no target: photographs are measured on planes. Put it into"
+                " receivers; heliostats aim at those too"
+            )
         return _none_of(context.get("tag", value), known, _OTHER_FORMS.get(str(path[-1])))
     if kind == "union_tag_not_found":
         return f"is missing; add it, one of {_kinds(path)}"

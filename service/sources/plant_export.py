@@ -2,29 +2,22 @@
 
 import csv
 import io
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from model.errors import InvalidInputError
 from model.locating import BracketMarks, locator_to_json
-from model.plant import Cylinder, Plant, TargetPlane
-from model.receivers import Cavity, Panels
+from model.plant import Plant, TargetPlane
 from model.sunshape import Buie
 from model.tracing import Optics
 from service.base.fields import JsonObject
 from service.base.plant_facts import PlantFacts
-from service.base.receivers import AnyReceiver
 from service.sources.documents import sun_to_json
 from service.sources.plant_formats.imported import LAYOUT, PLANT, plant_text, site
+from service.sources.plant_receivers import receiver_entry
 
 _LAYOUT = ("name", "type", "east_m", "north_m", "up_m", "receiver", "focal_length_m")
-
-_LEVEL = 1e-9
-"""Largest slope of the axis of a cylinder that counts as upright."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,57 +105,7 @@ def _entries(receivers: Mapping[str, Any], made: ExportedPlant) -> dict[str, obj
     return entries
 
 
-def receiver_entry(receiver: AnyReceiver) -> dict[str, object]:
-    """The entry of a receiver in ``plant.yaml``.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is a cylinder that leans.
-    """
-    if isinstance(receiver, TargetPlane):
-        return _plane(receiver)
-    if isinstance(receiver, Cylinder):
-        return _cylinder(receiver)
-    panels = [
-        {key: value for key, value in _plane(panel).items() if key not in ("kind", "absorptance")}
-        for panel in receiver.panels
-    ]
-    shared = {"panels": panels, "absorptance": receiver.absorptance}
-    if isinstance(receiver, Panels):
-        return {"kind": "panels", **shared}
-    assert isinstance(receiver, Cavity)
-    return {"kind": "cavity", "aperture_m": receiver.aperture.tolist(), **shared}
-
-
 def _target(target: TargetPlane) -> dict[str, object]:
     """The entry of a target, with what locates it: marks, if it declares nothing."""
-    plane = {key: value for key, value in _plane(target).items() if key != "absorptance"}
+    plane = {key: value for key, value in receiver_entry(target).items() if key != "absorptance"}
     return plane | locator_to_json(target.locator or BracketMarks())
-
-
-def _plane(plane: TargetPlane) -> dict[str, object]:
-    return {
-        "kind": "plane",
-        "center_m": plane.center.tolist(),
-        "normal": plane.normal.tolist(),
-        "up": plane.up.tolist(),
-        "width_m": plane.width,
-        "height_m": plane.height,
-        "absorptance": plane.absorptance,
-    }
-
-
-def _cylinder(cylinder: Cylinder) -> dict[str, object]:
-    east, north, _ = cylinder.normal.tolist()
-    if np.abs(cylinder.up - [0, 0, 1]).max() > _LEVEL:
-        raise InvalidInputError("a cylinder of plant.yaml is upright, and this one leans")
-    return {
-        "kind": "cylinder",
-        "center_m": cylinder.axis.tolist(),
-        "radius_m": cylinder.radius,
-        "height_m": cylinder.height,
-        "facing_azimuth_deg": round(math.degrees(math.atan2(east, north)) % 360, 12),
-        "opening_deg": cylinder.opening_deg,
-        "absorptance": cylinder.absorptance,
-    }

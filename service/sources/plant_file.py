@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 from model.atmosphere import attenuation_of_visibility
 from model.errors import InvalidInputError
 from model.heliostat_type import HeliostatType
-from model.plant import Heliostat, Plant, Tower
+from model.plant import Heliostat, Plant, TargetPlane, Tower
 from model.site import Site
 from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
-from service.sources.plant_errors import PlantText, mistakes_at
+from service.sources.plant_errors import Mistakes, PlantText, mistakes_at
 from service.sources.plant_receivers import AnyReceiver, read_receivers, read_targets
 from service.sources.plant_schema import (
     BuieSun,
     FacetFileEntry,
     GaussianSun,
     HeliostatEntry,
+    PlantDocument,
     assumed,
     nearest,
 )
@@ -91,7 +92,7 @@ def read_plant(path: Path) -> PlantDescription:
     Raises
     ------
     InvalidInputError
-        It names file, line and key path of the first mistake, and what to do.
+        It names file, line and key path of each mistake, and what to do.
     """
     return _PlantReader(PlantText.read(path)).plant()
 
@@ -106,11 +107,25 @@ class _PlantReader:
     def plant(self) -> PlantDescription:
         """The whole plant."""
         header = self.entries.plant
-        receivers = read_receivers(self.text)
-        targets = read_targets(self.text)
-        types = {name: read_type(self.text, name) for name in self.entries.heliostat_types}
-        layout = self._layout()
-        goals = {**receivers, **targets}
+        mistakes = Mistakes()
+        types: dict[str, HeliostatType] = {}
+        receivers: dict[str, AnyReceiver] = {}
+        targets: dict[str, TargetPlane] = {}
+        layout: list[PlacedHeliostat] = []
+        with mistakes.collected():
+            receivers = read_receivers(self.text)
+        with mistakes.collected():
+            targets = read_targets(self.text)
+        for name in self.entries.heliostat_types:
+            with mistakes.collected():
+                types[name] = read_type(self.text, name)
+        with mistakes.collected():
+            layout = self._layout()
+        for check in (self._time_zone, self._sun, self._attenuation):
+            with mistakes.collected():
+                check()
+        mistakes.require_none()
+        goals: dict[str, AnyReceiver] = {**receivers, **targets}
         receiver_of = self._receiver_of(layout, goals)
         heliostats = self._heliostats(layout, types, goals, receiver_of)
         site = Site(**header.model_dump(include={field.name for field in fields(Site)}))
@@ -130,20 +145,13 @@ class _PlantReader:
             time_zone=self._time_zone(),
             altitude=header.altitude_m,
             marks_of={name: target.marks for name, target in self.entries.targets.items()},
-            files=self._files(),
+            files=_files(self.entries),
             assumed=tuple(assumed(self.entries)),
-            warnings=tuple(self._warnings(layout)),
+            warnings=tuple(_warnings(self.text, layout)),
         )
 
     def _place(self, *path: str | int) -> str:
         return self.text.place(*path)
-
-    def _files(self) -> tuple[str, ...]:
-        """Files that the document names, each once."""
-        facets = [entry.facets for entry in self.entries.heliostat_types.values()]
-        named = [one.file for one in facets if isinstance(one, FacetFileEntry)]
-        layout = self.entries.layout.file
-        return tuple(dict.fromkeys([*([] if layout is None else [layout]), *named]))
 
     # --- site, sun, air
 
@@ -180,7 +188,7 @@ class _PlantReader:
 
     def _tower(self) -> Tower | None:
         tower = self.entries.tower
-        return None if tower is None else Tower(tower.radius_m, tower.height_m)
+        return None if tower is None else tower.tower()
 
     # --- heliostats
 
@@ -204,14 +212,15 @@ class _PlantReader:
                 f"{self._place()}: has neither receivers nor targets; heliostats need something to"
                 " aim at"
             )
-        first = next(iter(goals))
+        first, mistakes = next(iter(goals)), Mistakes()
         for placed in layout:
             if (placed.entry.receiver or first) not in goals:
                 known = nearest(str(placed.entry.receiver), list(goals))
-                raise InvalidInputError(
+                mistakes.found.append(
                     f"{placed.place}: receiver: {placed.entry.receiver!r} is no receiver or target;"
                     f" {known}"
                 )
+        mistakes.require_none()
         return {placed.entry.name: placed.entry.receiver or first for placed in layout}
 
     def _heliostats(
@@ -221,43 +230,41 @@ class _PlantReader:
         goals: dict[str, AnyReceiver],
         receiver_of: dict[str, str],
     ) -> dict[str, Heliostat]:
-        heliostats = {}
+        heliostats, mistakes = {}, Mistakes()
         for placed in layout:
             entry = placed.entry
-            if entry.type not in types:
-                known = nearest(entry.type, list(types))
-                raise InvalidInputError(
-                    f"{placed.place}: type: {entry.type[:60]!r} is no heliostat type; {known}"
-                )
-            goal = goals[receiver_of[entry.name]]
-            heliostats[entry.name] = place_heliostat(placed, types[entry.type], goal)
+            with mistakes.collected():
+                if entry.type not in types:
+                    known = nearest(entry.type, list(types))
+                    raise InvalidInputError(
+                        f"{placed.place}: type: {entry.type[:60]!r} is no heliostat type; {known}"
+                    )
+                goal = goals[receiver_of[entry.name]]
+                heliostats[entry.name] = place_heliostat(placed, types[entry.type], goal)
+        mistakes.require_none()
         return heliostats
-
-    def _warnings(self, layout: list[PlacedHeliostat]) -> Iterable[str]:
-        used = {placed.entry.type for placed in layout}
-        for name in self.entries.heliostat_types:
-            if name not in used:
-                yield f"{self._place('heliostat_types', name)}: has no heliostat in the layout"
 
 
 def _require_different(layout: list[PlacedHeliostat]) -> None:
     """Refuse two heliostats of one name, or within a centimetre of one place."""
+    mistakes = Mistakes()
     names: dict[str, str] = {}
     places: dict[tuple[float, ...], PlacedHeliostat] = {}
     for placed in layout:
         entry = placed.entry
         if entry.name in names:
-            raise InvalidInputError(
+            mistakes.found.append(
                 f"{placed.place}: name: {entry.name} is there twice, first in"
                 f" {names[entry.name]}; rename one"
             )
         foot = tuple(round(value, 2) for value in (entry.east_m, entry.north_m, entry.up_m))
         if foot in places:
-            raise InvalidInputError(
+            mistakes.found.append(
                 f"{placed.place}: {entry.name} is at the place of {places[foot].entry.name},"
                 f" {places[foot].place}; move or remove one"
             )
         names[entry.name], places[foot] = placed.place, placed
+    mistakes.require_none()
 
 
 def place_heliostat(
@@ -281,3 +288,18 @@ def place_heliostat(
         )
     with mistakes_at(placed.place):
         return of_type.heliostat(entry.name, foot, aim, entry.focal_length_m)
+
+
+def _warnings(text: PlantText, layout: list[PlacedHeliostat]) -> Iterable[str]:
+    used = {placed.entry.type for placed in layout}
+    for name in text.entries.heliostat_types:
+        if name not in used:
+            yield f"{text.place('heliostat_types', name)}: has no heliostat in the layout"
+
+
+def _files(entries: PlantDocument) -> tuple[str, ...]:
+    """Files that the document names, each once."""
+    facets = [entry.facets for entry in entries.heliostat_types.values()]
+    named = [one.file for one in facets if isinstance(one, FacetFileEntry)]
+    layout = entries.layout.file
+    return tuple(dict.fromkeys([*([] if layout is None else [layout]), *named]))

@@ -1,28 +1,23 @@
 """Receivers and targets of ``plant.yaml``."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Cylinder, TargetPlane
-from model.receivers import Cavity, Panels
+from service.base.fields import JsonObject
+from service.base.receivers import NAMES_WITH_UNITS, receiver_from_json, receiver_to_json
 from service.base.receivers import AnyReceiver as AnyReceiver
 from service.sources.plant_errors import PlantText, mistakes_at
-from service.sources.plant_schema import (
-    UP,
-    CavityReceiver,
-    CylinderReceiver,
-    PanelEntry,
-    PanelsReceiver,
-    ReceiverEntry,
-)
+from service.sources.plant_schema import UP, CylinderReceiver, ReceiverEntry
 from service.sources.yaml_text import KeyPath
 
-Array = NDArray[np.float64]
+_LEVEL = 1e-9
+"""Largest slope of the axis of a cylinder that counts as upright."""
 
 
 def read_receivers(plant: PlantText) -> dict[str, AnyReceiver]:
@@ -42,7 +37,7 @@ def read_targets(plant: PlantText) -> dict[str, TargetPlane]:
         if name in plant.entries.receivers:
             raise InvalidInputError(f"{place}: is a receiver's name too; rename one of them")
         with mistakes_at(place):
-            target = _plane(name, entry)
+            target = entry.named(name)
         with _camera_mistakes_at(plant, name):
             targets[name] = target.located_by(entry.locator_document)
     return targets
@@ -62,38 +57,38 @@ def _camera_mistakes_at(plant: PlantText, target: str) -> Iterator[None]:
         raise InvalidInputError(f"{plant.place(*path)}: {message}") from None
 
 
-def _plane(name: str, entry: PanelEntry, absorptance: float = 1.0) -> TargetPlane:
-    return TargetPlane(
-        name,
-        np.array(entry.center_m),
-        np.array(entry.normal),
-        np.array(entry.up),
-        entry.width_m,
-        entry.height_m,
-        absorptance,
-    )
-
-
 def _receiver(name: str, entry: ReceiverEntry) -> AnyReceiver:
     """The receiver of an entry."""
+    document = entry.model_dump(by_alias=False)
     if isinstance(entry, CylinderReceiver):
-        facing = sun_direction(entry.facing_azimuth_deg, 0.0)
-        return Cylinder(
-            name,
-            np.array(entry.center_m) + entry.radius_m * facing,
-            facing,
-            np.array(UP),
-            entry.radius_m,
-            entry.height_m,
-            entry.opening_deg,
-            entry.absorptance,
-        )
-    if isinstance(entry, PanelsReceiver | CavityReceiver):
-        panels = tuple(
-            _plane(f"{name}-{number}", panel, entry.absorptance)
-            for number, panel in enumerate(entry.panels, start=1)
-        )
-        if isinstance(entry, PanelsReceiver):
-            return Panels(name, panels, entry.absorptance)
-        return Cavity(name, panels, entry.absorptance, aperture=np.array(entry.aperture_m))
-    return _plane(name, entry, entry.absorptance)
+        facing = sun_direction(document.pop("facing_azimuth_deg"), 0.0)
+        center = np.array(entry.center) + entry.radius * facing
+        document |= {"center": center, "normal": facing, "up": UP}
+    return receiver_from_json(name, document)
+
+
+def receiver_entry(receiver: AnyReceiver) -> JsonObject:
+    """The entry of a receiver in ``plant.yaml``.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is a cylinder that leans.
+    """
+    document = receiver_to_json(receiver)
+    if isinstance(receiver, Cylinder):
+        if np.abs(receiver.up - UP).max() > _LEVEL:
+            raise InvalidInputError("a cylinder of plant.yaml is upright, and this one leans")
+        east, north, _ = document.pop("normal")
+        del document["up"]
+        document["center"] = receiver.axis.tolist()
+        document["facing_azimuth_deg"] = round(math.degrees(math.atan2(east, north)) % 360, 12)
+    return _entry(document)
+
+
+def _entry(document: JsonObject) -> JsonObject:
+    """A receiver or panel with the keys of ``plant.yaml``."""
+    return {
+        NAMES_WITH_UNITS.get(name, name): [*map(_entry, value)] if name == "panels" else value
+        for name, value in document.items()
+    }

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import (
     BaseModel,
     BeforeValidator,
+    ConfigDict,
     Discriminator,
     Field,
     StringConstraints,
@@ -17,19 +18,12 @@ from pydantic import (
     model_validator,
 )
 
-from model.plant import require_cylinder_shape, require_plane_shape
-from service.base.fields import (
-    Direction,
-    Extent,
-    Flag,
-    Metres,
-    Model,
-    Name,
-    Number,
-    Position,
-    Whole,
-)
+from model.actuator import LinearActuator
+from model.plant import require_cylinder_shape
+from service.base.fields import Extent, Flag, Metres, Model, Name, Number, Plane, Position, Whole
 from service.base.names import LINE, NAME
+from service.base.plant_facts import TowerSize
+from service.base.receivers import NAMES_WITH_UNITS
 
 MAX_HELIOSTATS = 50_000
 """Most heliostats of a plant."""
@@ -47,7 +41,7 @@ class PlantPart(Model):
     @classmethod
     def _known_keys(cls, data: Any) -> Any:
         if isinstance(data, dict):
-            known = list(cls.model_fields)
+            known = [field.alias or name for name, field in cls.model_fields.items()]
             for key, value in data.items():
                 if key not in known:
                     raise KeyMistakeError(key, f"is not known here; {nearest(key, known)}")
@@ -127,19 +121,39 @@ class PlantHeader(PlantPart):
 # --------------------------------------------------------------------------------------------------
 
 
-class LinearDrive(PlantPart):
-    """A spindle that turns an axis, as of `model.actuator.LinearActuator`."""
+class Spindle(BaseModel):
+    """`model.actuator.LinearActuator`, with its names."""
 
     kind: Literal["linear"] = Field(description="A spindle.")
-    increment_steps_per_m: Steps = Field(description="Steps for one metre of stroke [1/m].")
-    initial_stroke_length_m: Annotated[Number, Field(ge=0, le=100)] = Field(
+    increment: Steps = Field(description="Steps for one metre of stroke [1/m].")
+    initial_stroke_length: Annotated[Number, Field(ge=0, le=100)] = Field(
         description="At zero steps [m]."
     )
-    offset_m: Arm = Field(description="From the axis to the spindle's fixed end [m].")
-    pivot_radius_m: Arm = Field(description="From the axis to the spindle's moving end [m].")
-    initial_angle_rad: Angle = Field(description="Axis angle at zero steps [rad].")
+    offset: Arm = Field(description="From the axis to the spindle's fixed end [m].")
+    pivot_radius: Arm = Field(description="From the axis to the spindle's moving end [m].")
+    initial_angle: Angle = Field(description="Axis angle at zero steps [rad].")
     clockwise: Flag = Field(description="Whether the angle decreases as the stroke increases.")
-    max_increment_steps: Steps = Field(description="The end of travel [steps].")
+    max_increment: Steps = Field(description="The end of travel [steps].")
+
+    def actuator(self) -> LinearActuator:
+        """As the model has it."""
+        return LinearActuator(**self.model_dump(exclude={"kind"}, by_alias=False))
+
+
+_SPINDLE_KEYS = {
+    "increment": "increment_steps_per_m",
+    "initial_angle": "initial_angle_rad",
+    "max_increment": "max_increment_steps",
+    **{name: f"{name}_m" for name in ("initial_stroke_length", "offset", "pivot_radius")},
+}
+
+
+class LinearDrive(PlantPart, Spindle):
+    """A spindle that turns an axis, as of `model.actuator.LinearActuator`."""
+
+    model_config = ConfigDict(
+        alias_generator=lambda name: _SPINDLE_KEYS.get(name, name), serialize_by_alias=True
+    )
 
 
 class RotaryDrive(PlantPart):
@@ -283,18 +297,23 @@ class HeliostatTypeEntry(PlantPart):
 # --------------------------------------------------------------------------------------------------
 
 
-class HeliostatEntry(PlantPart):
+class HeliostatPlace(PlantPart):
+    """The foot of a heliostat's pylon, and what it is made for."""
+
+    east_m: Metres = Field(description="Of the pylon's foot from the tower base [m].")
+    north_m: Metres = Field(description="Of the pylon's foot from the tower base [m].")
+    up_m: Metres = Field(description="Of the pylon's foot above the tower base [m].")
+    receiver: NumberedName | None = Field(
+        None, description="The receiver or target that it is canted to; without it the first."
+    )
+    focal_length_m: Length | None = Field(None, description="In place of its slant range [m].")
+
+
+class HeliostatEntry(HeliostatPlace):
     """A heliostat: its type, and the foot of its pylon."""
 
     name: NumberedName
     type: NumberedName
-    east_m: Metres
-    north_m: Metres
-    up_m: Metres
-    receiver: NumberedName | None = Field(
-        None, description="What it is canted and focused to; the first receiver without it."
-    )
-    focal_length_m: Length | None = Field(None, description="In place of its slant range.")
 
 
 TypeChoice = Annotated[
@@ -321,19 +340,14 @@ class LayoutEntry(PlantPart):
 # --------------------------------------------------------------------------------------------------
 
 
-class PanelEntry(PlantPart):
+class SurfacePart(PlantPart):
+    """Base of receivers and targets: fields as of `service.base.receivers`, keys with units."""
+
+    model_config = ConfigDict(alias_generator=lambda name: NAMES_WITH_UNITS.get(name, name))
+
+
+class PanelEntry(SurfacePart, Plane):
     """A rectangle; its normal is on the lit side."""
-
-    center_m: Position
-    normal: Direction = Field(description="East, north, up; of any length.")
-    up: Direction = Field(UP, description="Upwards in its map; not parallel to the normal.")
-    width_m: Extent
-    height_m: Extent
-
-    @model_validator(mode="after")
-    def _near_square(self) -> Self:
-        require_plane_shape(self.width_m, self.height_m)
-        return self
 
 
 class PlaneReceiver(PanelEntry):
@@ -343,13 +357,13 @@ class PlaneReceiver(PanelEntry):
     absorptance: Reflectance = 1.0
 
 
-class CylinderReceiver(PlantPart):
+class CylinderReceiver(SurfacePart):
     """An upright cylinder or a part of one, lit from outside."""
 
     kind: Literal["cylinder"]
-    center_m: Position = Field(description="On the axis, at mid height.")
-    radius_m: Annotated[Number, Field(ge=0.01, lt=1e3)]
-    height_m: Extent
+    center: Position = Field(description="On the axis, at mid height.")
+    radius: Annotated[Number, Field(ge=0.01, lt=1e3)]
+    height: Extent
     facing_azimuth_deg: Azimuth360 = Field(
         0.0, description="Where the middle column of its map faces, from north over east."
     )
@@ -360,14 +374,14 @@ class CylinderReceiver(PlantPart):
 
     @model_validator(mode="after")
     def _near_square(self) -> Self:
-        require_cylinder_shape(self.radius_m, self.height_m, self.opening_deg)
+        require_cylinder_shape(self.radius, self.height, self.opening_deg)
         return self
 
 
 Panelled = Annotated[list[PanelEntry], Field(min_length=1, max_length=64)]
 
 
-class PanelsReceiver(PlantPart):
+class PanelsReceiver(SurfacePart):
     """Planes of one height side by side, lit from outside, from left to right."""
 
     kind: Literal["panels"]
@@ -375,11 +389,11 @@ class PanelsReceiver(PlantPart):
     absorptance: Reflectance = 1.0
 
 
-class CavityReceiver(PlantPart):
+class CavityReceiver(SurfacePart):
     """Panels behind an opening."""
 
     kind: Literal["cavity"]
-    aperture_m: Annotated[list[Position], Field(min_length=3, max_length=64)] = Field(
+    aperture: Annotated[list[Position], Field(min_length=3, max_length=64)] = Field(
         description="Corners of the opening, in one plane, counter-clockwise seen from outside."
     )
     panels: Panelled
@@ -486,11 +500,8 @@ class LocatorDocument(PlantPart):
     camera: CameraEntry | None = None
 
 
-class TowerEntry(PlantPart):
+class TowerEntry(PlantPart, TowerSize):
     """The tower, an upright cylinder that casts a shadow."""
-
-    radius_m: Annotated[Number, Field(gt=0, lt=1e3)]
-    height_m: Annotated[Number, Field(gt=0, lt=1e4)]
 
 
 # --- sun and air
@@ -592,8 +603,8 @@ def _without_null(schema: Any) -> Any:
 
 def assumed(part: BaseModel, path: str = "") -> Iterator[str]:
     """Yield what a document leaves to its defaults, as lines ``key.path: value``."""
-    for name in type(part).model_fields:
-        value, where = getattr(part, name), f"{path}{name}"
+    for name, field in type(part).model_fields.items():
+        value, where = getattr(part, name), f"{path}{field.alias or name}"
         if name not in part.model_fields_set:
             if value is None:
                 yield from [f"{where}: {_ABSENT[name]}"] if name in _ABSENT else []

@@ -1,9 +1,6 @@
 """CSV files of a plant: the layout of its heliostats, and the facets of a type."""
 
-import csv
-import io
-import re
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,24 +10,19 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from model.heliostat_type import FacetDesign, circle_outline
 from model.plant import Outline, outline_share
-from service.base.names import NAME, is_text, require_name
+from service.base.names import NAME, require_name
 from service.sources.files import file_name, read_text
+from service.sources.plant_errors import Mistakes
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry, nearest
+from service.sources.text_lines import ForeignLine, csv_lines, to_number
 
 Array = NDArray[np.float64]
 
 MAX_CSV_BYTES = 2**24
 """Largest CSV file of a plant [bytes]."""
 
-_NUMBER = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-
 MAX_CORNERS = 64
 """Most corners of a facet's polygon."""
-
-
-def to_number(text: str) -> float:
-    """The decimal number of a text; NaN if it is none."""
-    return float(text) if _NUMBER.fullmatch(text) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -96,42 +88,25 @@ def parse_rows(name: str, text: str, columns: CsvColumns, most: int) -> list[Csv
         If it cannot be read, columns are missing, unknown or there twice, a line has other than one
         cell a column, or there are no rows or more than ``most``. It names file and line.
     """
-    lines = _lines(name, text)
-    try:
-        head = next(lines, None)
-        if head is None:
-            raise InvalidInputError(f"{name}: is empty; its first line has the column names")
-        standard = _standard_names(head, columns)
-        rows: list[CsvRow] = []
-        for row in lines:
-            if len(row.cells) != len(standard):
-                raise InvalidInputError(
-                    f"{row.place}: has {len(row.cells)} cells, {len(standard)} are the columns"
-                )
-            if len(rows) == most:
-                raise InvalidInputError(f"{row.place}: at most {most} lines are read")
-            rows.append(CsvRow(row.place, dict(zip(standard, row.cells.values(), strict=True))))
-    except csv.Error as error:
-        raise InvalidInputError(f"{name}: is no CSV ({error})") from None
+    lines = csv_lines(name, text)
+    head = next(lines, None)
+    if head is None:
+        raise InvalidInputError(f"{name}: is empty; its first line has the column names")
+    standard = _standard_names(head, columns)
+    rows: list[CsvRow] = []
+    for line in lines:
+        if len(line.cells) != len(standard):
+            raise line.refuse(f"has {len(line.cells)} cells, {len(standard)} are the columns")
+        if len(rows) == most:
+            raise line.refuse(f"at most {most} lines are read")
+        rows.append(CsvRow(line.place, dict(zip(standard, line.cells, strict=True))))
     if not rows:
         raise InvalidInputError(f"{name}: has no line below its column names")
     return rows
 
 
-def _lines(name: str, text: str) -> Iterator[CsvRow]:
-    """Lines that are not blank, their cells by column number."""
-    reader = csv.reader(io.StringIO(text, newline=""))
-    for cells in reader:
-        place = f"{name}, line {reader.line_num}"
-        stripped = [cell.strip() for cell in cells]
-        if any(stripped) and not stripped[0].startswith("#"):
-            if not all(map(is_text, stripped)):
-                raise InvalidInputError(f"{place}: has a control character; remove it")
-            yield CsvRow(place, {str(index): cell for index, cell in enumerate(stripped)})
-
-
-def _standard_names(head: CsvRow, columns: CsvColumns) -> list[str]:
-    given = list(head.cells.values())
+def _standard_names(head: ForeignLine, columns: CsvColumns) -> list[str]:
+    given = head.cells
     standard = [columns.names.get(name, name) for name in given]
     for name, label in zip(standard, given, strict=True):
         if name not in columns.known:
@@ -168,11 +143,13 @@ class PlacedHeliostat:
 
 
 def read_layout(path: Path) -> list[PlacedHeliostat]:
-    """Heliostats of a layout file; InvalidInputError names file and line."""
-    return [
-        PlacedHeliostat(row.place, _heliostat(row))
-        for row in read_rows(path, _LAYOUT, MAX_HELIOSTATS)
-    ]
+    """Heliostats of a layout file; InvalidInputError names file and line of each mistake."""
+    placed, mistakes = [], Mistakes()
+    for row in read_rows(path, _LAYOUT, MAX_HELIOSTATS):
+        with mistakes.collected():
+            placed.append(PlacedHeliostat(row.place, _heliostat(row)))
+    mistakes.require_none()
+    return placed
 
 
 def _heliostat(row: CsvRow) -> HeliostatEntry:
@@ -281,7 +258,9 @@ def _shape(row: CsvRow) -> FacetShape:
 def _polygon(row: CsvRow, text: str) -> FacetShape:
     """The shape of a polygon ``x y; x y; ..`` [m] about the facet's centre."""
     corners = [corner.split() for corner in text.strip("; ").split(";")]
-    is_read = all(len(corner) == 2 and all(map(_NUMBER.fullmatch, corner)) for corner in corners)
+    is_read = all(
+        len(corner) == 2 and np.isfinite([*map(to_number, corner)]).all() for corner in corners
+    )
     if not is_read or not 3 <= len(corners) <= MAX_CORNERS:
         raise row.wrong(
             "polygon",

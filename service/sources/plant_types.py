@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-from model.actuator import Actuator, LinearActuator, RotaryActuator
+from model.actuator import Actuator, RotaryActuator
 from model.errors import InvalidInputError
 from model.heliostat_type import Canting, FacetDesign, Focus, HeliostatType, MountDesign, facet_grid
 from model.plant import REFERENCE_SINE, MirrorOptics
@@ -147,15 +147,7 @@ def _actuator(drive: LinearDrive | RotaryDrive | IdealDrive) -> Actuator:
     if isinstance(drive, RotaryDrive):
         increment = drive.steps_per_rad or (drive.gear or 1.0) / (2 * math.pi)
         return RotaryActuator(increment, drive.initial_angle_rad, drive.clockwise)
-    return LinearActuator(
-        increment=drive.increment_steps_per_m,
-        initial_stroke_length=drive.initial_stroke_length_m,
-        offset=drive.offset_m,
-        pivot_radius=drive.pivot_radius_m,
-        initial_angle=drive.initial_angle_rad,
-        clockwise=drive.clockwise,
-        max_increment=drive.max_increment_steps,
-    )
+    return drive.actuator()
 
 
 def _focus(entry: HeliostatTypeEntry) -> Focus:

@@ -300,7 +300,7 @@ class WeatherDocument(WeatherFields, DocumentPart):
     """The weather of a measurement in PAINT's folder."""
 
 
-class Spots(DocumentPart):
+class FocalSpots(DocumentPart):
     """PAINT's ``focal_spot``: the centroid by two methods; UTIS is preferred."""
 
     UTIS: Wgs84 | None = Field(
@@ -316,7 +316,7 @@ class CalibrationProperties(Document, WeatherDocument):
     sun_azimuth: AzimuthFromSouth
     sun_elevation: Elevation
     motor_position: MotorDocument | None = None
-    focal_spot: Spots | None = None
+    focal_spot: FocalSpots | None = None
 
 
 def parse_time(given: Any) -> Any:

@@ -273,8 +273,9 @@ def require_store(settings: Settings) -> None:
     file = settings.database.database
     if settings.database.get_backend_name() == "sqlite" and not (file and Path(file).is_file()):
         raise InvalidInputError(
-            f"{file}: there is no store; `heliotwin import` or `heliotwin serve` makes one, or set"
-            " HELIOTWIN_DATA_DIR or HELIOTWIN_DATABASE_URL to where it is"
+            f"{file and Path(file).absolute()}: there is no store; set HELIOTWIN_DATA_DIR or"
+            " HELIOTWIN_DATABASE_URL to where it is, or make one by `heliotwin serve`, `heliotwin"
+            " import` or `heliotwin migrate`"
         )
 
 

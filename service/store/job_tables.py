@@ -1,7 +1,7 @@
 """Tables of jobs, their steps, API keys, sessions, acknowledgements and the audit trail."""
 
 from datetime import datetime
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from sqlalchemy import ForeignKey, Index, LargeBinary, String, Text, UniqueConstraint, false, text
 from sqlalchemy.orm import Mapped, mapped_column
@@ -81,19 +81,31 @@ class JobStepRow(Base):
 class KeyRow(Base):
     """An API key by its hash.
 
-    A withdrawn key remains, so that its name stays unambiguous in the audit trail.
+    A withdrawn key remains, so that its name stays unambiguous in the audit trail. ``number``
+    counts the keys of a name, which follow one another by rotation. ``last_used_at`` is kept to the
+    hour.
     """
 
     __tablename__ = "api_keys"
-    __table_args__ = (one_of("role", ROLES),)
+    __table_args__ = (one_of("role", ROLES), UniqueConstraint("name", "number"))
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    name: Mapped[str] = mapped_column(String(64), unique=True)
+    name: Mapped[str] = mapped_column(String(64))
+    number: Mapped[int] = mapped_column(default=1)
     prefix: Mapped[str] = mapped_column(String(16), unique=True)
     sha256: Mapped[str] = mapped_column(String(64))
     role: Mapped[str] = mapped_column(String(16))
     created_at: Mapped[datetime] = mapped_column(default=now)
+    expires_at: Mapped[datetime | None]
+    last_used_at: Mapped[datetime | None]
     withdrawn_at: Mapped[datetime | None]
+
+    @property
+    def state(self) -> Literal["valid", "expired", "withdrawn"]:
+        """Whether it is valid now."""
+        if self.withdrawn_at is not None:
+            return "withdrawn"
+        return "valid" if self.expires_at is None or self.expires_at > now() else "expired"
 
 
 class SessionRow(Base):
@@ -134,7 +146,7 @@ class AlarmRow(Base):
 
     ``since`` and ``ended_at`` are times of the data; ``ended_at`` is None while it is present.
     ``recorded_at`` is when a worker first wrote it. ``measurements`` are identifiers of the
-    heliostat's measurements to look at.
+    heliostat's measurements to look at. ``offer`` is a `service.twin.alarms.offers.Offer`.
     """
 
     __tablename__ = "alarms"
@@ -146,6 +158,7 @@ class AlarmRow(Base):
     message: Mapped[str] = mapped_column(Text)
     action: Mapped[str] = mapped_column(Text)
     measurements: Mapped[list[str]]
+    offer: Mapped[dict[str, object] | None]
     since: Mapped[datetime]
     recorded_at: Mapped[datetime] = mapped_column(default=now)
     ended_at: Mapped[datetime | None] = mapped_column(index=True)

@@ -36,6 +36,15 @@ class Period:
     since: datetime | None = None
     until: datetime | None = None
 
+    def contains(self, at: datetime | None) -> bool:
+        """Whether a time, or an unknown one, is in the interval."""
+        if at is None:
+            return self == EVER
+        return not (
+            (self.since is not None and at < self.since)
+            or (self.until is not None and at >= self.until)
+        )
+
     def conditions(self, column: Any) -> list[ColumnElement[bool]]:
         """Conditions that a column of times lies in the interval."""
         after = [] if self.since is None else [column >= self.since]

@@ -88,45 +88,53 @@ def list_forecasts(
     return session.scalars(select_after(session, query, ForecastRow, order, after)).all()
 
 
-def recent_forecasts(session: Session, limit: int) -> Sequence[ForecastRow]:
-    """The newest ``limit`` forecasts, newest first."""
-    return session.scalars(
-        select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)
-    ).all()
-
-
 @dataclass(frozen=True)
-class FieldForecast:
-    """Summary of a forecast of many heliostats: its job, without the flux map."""
+class ForecastLine:
+    """A forecast in a list, without its map: of one heliostat, or of many by the ``job``."""
 
-    job: int
-    created_at: datetime
-    heliostats: int
+    number: int
+    job: bool
+    heliostats: str
     target: str | None
-    sun_azimuth_deg: float | None
-    sun_elevation_deg: float | None
+    sun: Mapping[str, float]
     peak_w_m2: float
+    created_at: datetime
 
 
-def recent_field_forecasts(session: Session, limit: int) -> list[FieldForecast]:
-    """The newest ``limit`` forecasts of many heliostats, newest first.
+def recent_forecasts(session: Session, limit: int) -> list[ForecastLine]:
+    """The newest ``limit`` forecasts of one heliostat and of many, newest first.
 
-    The database extracts the values from the JSON results.
+    The database extracts the values from the JSON results of jobs.
     """
-    result, payload = JobRow.result, JobRow.payload
+    newest = select(ForecastRow).options(*_NAMES).order_by(ForecastRow.id.desc()).limit(limit)
+    lines = [
+        ForecastLine(
+            row.id,
+            False,
+            row.heliostat.name,
+            row.target_name,
+            row.document["sun"],
+            row.document["peak_w_m2"],
+            row.created_at,
+        )
+        for row in session.scalars(newest)
+    ]
+    result = JobRow.result
     query = select(
         JobRow.id,
-        JobRow.created_at,
         result["heliostats"].as_integer(),
-        payload["target"].as_string(),
-        result["sun"]["azimuth_deg"].as_float(),
-        result["sun"]["elevation_deg"].as_float(),
+        JobRow.payload["target"].as_string(),
+        result["sun"].as_json(),
         result["peak_w_m2"].as_float(),
+        JobRow.created_at,
     ).where(JobRow.kind == "forecasts", JobRow.state == "done")
-    return [
-        FieldForecast(*row)
-        for row in session.execute(query.order_by(JobRow.id.desc()).limit(limit))
+    lines += [
+        ForecastLine(number, True, f"{heliostats} together", *more)
+        for number, heliostats, *more in session.execute(
+            query.order_by(JobRow.id.desc()).limit(limit)
+        )
     ]
+    return sorted(lines, key=lambda line: line.created_at, reverse=True)[:limit]
 
 
 @dataclass(frozen=True)
@@ -183,6 +191,11 @@ def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
     return row
 
 
+def newest_study(session: Session) -> StudyRow | None:
+    """The newest study; None without any."""
+    return session.scalar(select(StudyRow).order_by(StudyRow.id.desc()).limit(1))
+
+
 def has_study_page(session: Session, number: int) -> bool:
     """Whether a study has an HTML page, without loading it."""
     query = select(StudyRow.id).where(StudyRow.id == number, StudyRow.html.is_not(None))
@@ -207,18 +220,42 @@ def list_studies(
 
 @dataclass(frozen=True)
 class StudyFindings:
-    """Parts of a study's report: the effects found, and the share of the error that is left."""
+    """Parts of a study's report: the effects found, and the share of the error that is left.
 
+    ``transfer`` and ``explained_share`` are those of its discrepancy, None without one.
+    """
+
+    verdict: str
     effects: Sequence[Mapping[str, Any]]
     unexplained_share: float
+    transfer: Mapping[str, Any] | None = None
+    explained_share: float | None = None
+
+    @property
+    def is_correction(self) -> bool:
+        """Whether a correction without a cause would be adopted, instead of effects."""
+        return self.verdict == "unexplained" and self.transfer is not None
+
+    @property
+    def share_left(self) -> float:
+        """Share of the error that is left by what would be adopted."""
+        share = self.explained_share if self.is_correction else None
+        return self.unexplained_share if share is None else 1 - share
 
 
 def study_findings(session: Session, studies: Sequence[int]) -> dict[int, StudyFindings]:
     """Findings by study id. The database extracts them from the reports."""
     report = StudyRow.report
-    query = select(StudyRow.id, report["effects"], report["unexplained_share"].as_float())
+    query = select(
+        StudyRow.id,
+        StudyRow.verdict,
+        report["effects"],
+        report["unexplained_share"].as_float(),
+        report[("discrepancy", "transfer")],
+        report[("discrepancy", "explained_share")].as_float(),
+    )
     rows = session.execute(query.where(StudyRow.id.in_(studies)))
-    return {number: StudyFindings(effects, share) for number, effects, share in rows}
+    return {number: StudyFindings(*found) for number, *found in rows}
 
 
 def times_of_photographs(session: Session, keys: Iterable[str]) -> dict[str, datetime | None]:

@@ -9,7 +9,7 @@ import re
 import secrets
 from datetime import timedelta
 
-from sqlalchemy import delete, select
+from sqlalchemy import Select, delete, select
 from sqlalchemy.orm import Session
 
 from service.store.columns import now
@@ -54,15 +54,17 @@ def begin(session: Session, key: KeyRow) -> str:
     return token
 
 
+def valid_keys() -> Select[KeyRow]:
+    """Select the keys that are neither withdrawn nor expired."""
+    is_lasting = KeyRow.expires_at.is_(None) | (KeyRow.expires_at > now())
+    return select(KeyRow).where(KeyRow.withdrawn_at.is_(None), is_lasting)
+
+
 def find_key(session: Session, token: str) -> KeyRow | None:
-    """The key of a session; None if the session has ended or the key is withdrawn."""
+    """The key of a session; None if the session has ended, or the key is no longer valid."""
     if not is_token(token):
         return None
-    query = (
-        select(KeyRow)
-        .join(SessionRow, SessionRow.key_id == KeyRow.id)
-        .where(KeyRow.withdrawn_at.is_(None))
-    )
+    query = valid_keys().join(SessionRow, SessionRow.key_id == KeyRow.id)
     return session.scalar(
         query.where(SessionRow.sha256 == _sha256(token), SessionRow.expires_at > now())
     )

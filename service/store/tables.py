@@ -101,6 +101,7 @@ class HeliostatRow(Base):
 class TargetRow(Base):
     """A target plane in ENU [m].
 
+    - ``geometry`` is a `service.base.fields.Plane`.
     - ``corners`` are its WGS84 corners, if known.
     - ``locator`` is how photographs show where it is (`model.locating`), if it is declared.
     """
@@ -109,11 +110,7 @@ class TargetRow(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(String(64), unique=True)
-    center_m: Mapped[list[float]]
-    normal: Mapped[list[float]]
-    up: Mapped[list[float]]
-    width_m: Mapped[float]
-    height_m: Mapped[float]
+    geometry: Mapped[JsonObject]
     corners: Mapped[dict[str, list[float]] | None]
     locator: Mapped[dict[str, object] | None]
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
@@ -122,25 +119,15 @@ class TargetRow(Base):
 class ReceiverRow(Base):
     """A receiver in ENU [m], of a ``kind`` of `service.base.receivers`.
 
-    ``center_m``, ``normal``, ``up`` and ``height_m`` are those of its middle. ``width_m`` is a
-    plane's, ``radius_m`` and ``opening_deg`` a cylinder's. ``panels`` are as in REST.
+    ``geometry`` has the other fields of its document.
     """
 
     __tablename__ = "receivers"
 
     id: Mapped[int] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(String(64), unique=True)
-    center_m: Mapped[list[float]]
-    normal: Mapped[list[float]]
-    up: Mapped[list[float]]
-    height_m: Mapped[float]
-    width_m: Mapped[float | None]
-    radius_m: Mapped[float | None]
-    opening_deg: Mapped[float | None]
-    panels: Mapped[list[JsonObject] | None]
-    aperture_m: Mapped[list[list[float]] | None]
-    kind: Mapped[str] = mapped_column(String(16), server_default="cylinder")
-    absorptance: Mapped[float] = mapped_column(server_default="1")
+    kind: Mapped[str] = mapped_column(String(16))
+    geometry: Mapped[JsonObject]
     updated_at: Mapped[datetime] = mapped_column(default=now, onupdate=now)
 
 
@@ -185,6 +172,7 @@ class MeasurementRow(Base):
     """A measurement of a heliostat's focal spot in one photograph, or from motor positions only.
 
     - ``arrays`` holds npz ``flux`` and ``centered``. A refused image has neither, but a ``reason``.
+      A centred image has all of it as ``square``, and no ``flux``.
     - ``kind`` is `NO_IMAGE` without an image. Such a measurement serves only mount calibration.
     - ``taken_at`` is None if the time is unknown.
     - ``warnings`` are documents with a ``type`` and a ``detail``; None if there are none.
@@ -477,11 +465,10 @@ class FieldStateRow(Base):
 
 
 class ForecastRow(Base):
-    """A computed flux map: its inputs, npz ``flux`` (rows, columns) float32 [W/m2] and key figures.
+    """A computed flux map: its inputs and key figures, and npz ``flux`` (rows, columns) float32
+    [W/m2].
 
-    ``sun_at`` is the requested time, or None if the request gave a sun position. ``losses`` are
-    those of `service.twin.forecasts.watts.LightWatts`.
-    ``warnings`` are notes for readers of the forecast.
+    ``document`` has the other fields of `service.web.api.forecasts.ForecastSummary`.
     """
 
     __tablename__ = "forecasts"
@@ -490,24 +477,7 @@ class ForecastRow(Base):
     heliostat_id: Mapped[int] = mapped_column(ForeignKey("heliostats.id"), index=True)
     surface_id: Mapped[int | None] = mapped_column(ForeignKey("surfaces.id"), index=True)
     target_name: Mapped[str | None] = mapped_column(String(64))
-    plane: Mapped[dict[str, Any]]
-    sun_azimuth_deg: Mapped[float]
-    sun_elevation_deg: Mapped[float]
-    sun_at: Mapped[datetime | None]
-    aim_point_m: Mapped[list[float] | None]
-    motor_position: Mapped[list[float] | None]
-    dni_w_m2: Mapped[float]
-    window_m: Mapped[float | None]
-    normalised: Mapped[bool]
-    rows: Mapped[int]
-    columns: Mapped[int]
-    peak_w_m2: Mapped[float]
-    power_w: Mapped[float]
-    center_right_m: Mapped[float | None]
-    center_up_m: Mapped[float | None]
-    losses: Mapped[JsonObject]
-    model_version: Mapped[str] = mapped_column(String(MODEL_VERSION))
-    warnings: Mapped[list[str] | None]
+    document: Mapped[JsonObject]
     flux: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
 

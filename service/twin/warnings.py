@@ -32,8 +32,8 @@ def sun_warnings(contradiction: SunContradiction | None) -> Warnings:
     """The warning of a sun that contradicts its time, or none."""
     if contradiction is None:
         return []
-    angle_deg = round(contradiction.angle_deg, 3)
-    return [{"type": SUN_CONTRADICTS_TIME, "detail": contradiction.detail, "angle_deg": angle_deg}]
+    found = {"angle_deg": round(contradiction.angle_deg, 3), "clock_ahead_h": contradiction.ahead_h}
+    return [{"type": SUN_CONTRADICTS_TIME, "detail": contradiction.detail, **found}]
 
 
 def other_warnings(row: MeasurementRow, photograph: Photograph) -> Warnings:

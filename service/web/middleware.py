@@ -26,6 +26,7 @@ from service.base import logs
 from service.base.fair_queue import as_caller
 from service.base.metrics import REQUEST_SECONDS, REQUESTS
 from service.base.settings import Settings
+from service.store.keys import record_use
 from service.twin.runtime.slots import STOPPING
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter, HeldBody, JsonShape
@@ -196,6 +197,7 @@ class AuthMiddleware:
         )
         # Separate threads, so that keys are checked even while predictions take all others.
         self.threads = CapacityLimiter(8)
+        self.recording: set[int] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -207,8 +209,22 @@ class AuthMiddleware:
             identity = scope.get("state", {}).get("identity")
             with as_caller("" if identity is None else identity.name):
                 await self.app(scope, receive, self._charging(scope, send))
+            await self._record_use(scope, identity)
             return
         await self.app(scope, receive, send)
+
+    async def _record_use(self, scope: Scope, identity: security.Identity | None) -> None:
+        """Record the use of a key after the response, by one request at a time."""
+        key = None if identity is None else identity.unrecorded
+        if key is None or key in self.recording:
+            return
+        self.recording.add(key)
+        try:
+            await to_thread.run_sync(record_use, scope["app"].state.runtime.database, key)
+        except (OperationalError, PoolTimeoutError) as error:  # a later request does
+            logger.warning("the use of a key is not recorded: %s", error)
+        finally:
+            self.recording.discard(key)
 
     def _charging(self, scope: Scope, send: Send) -> Send:
         """Wrap ``send`` so that the sender pays for the response by its size."""

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from typer.testing import CliRunner
 
+from heliotwin.cli.main import app as command
 from model.effects import CATALOGUE, effect_from_json
 from model.fleet import Superposition, superpose, tile_of
 from model.frames import sun_direction
@@ -29,7 +30,6 @@ from model.study.advice import photographs_to_distinguish
 from model.surface import control_points
 from model.tracing import Optics, Window
 from service.base.settings import Settings
-from service.cli.main import app as command
 from service.sources.folder import read_declared, read_folder
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.transfer.importing import import_folder

@@ -452,6 +452,7 @@ def _of_worker(_dockerfile: list[tuple[str, str]], compose: dict[str, Any]) -> l
     return command
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("command_of", [_of_image, _of_compose, _of_worker])
 @pytest.mark.parametrize(("status", "is_healthy"), [(200, True), (503, False)])
 def test_health_check_command(

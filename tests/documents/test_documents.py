@@ -10,8 +10,8 @@ from typer.main import get_command
 
 from docs.backend import GUIDE
 from docs.generate import FOLDER, write_pages
+from heliotwin.cli.main import app
 from service.base.settings import Settings
-from service.cli.main import app
 from service.twin.alarms.reasons import REASONS
 
 from .prose import DOCS, ROOT, pages, sentences, statistics_of

@@ -50,7 +50,7 @@ class ShiftedClock(datetime):
 def run(what: str) -> None:
     """Serve, or work as a worker, until a signal ends it."""
     columns.datetime = ShiftedClock  # type: ignore[misc]
-    runtime.load_operations = lambda networks: SlowOperations()  # type: ignore[assignment]
+    runtime.load_operations = lambda *_: SlowOperations()  # type: ignore[assignment]
     if what == "worker":
         work(Settings(), KINDS)
     else:

@@ -12,12 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import heliotwin
+from model.plant import Heliostat
 from model.surface import control_points
 from service.sources.folder import read_folder
 from tests.service.command import heliotwin as command
 
+pytestmark = pytest.mark.xdist_group("library")  # one worker makes the plant
 NOON = datetime(2026, 6, 21, 11, 36, tzinfo=UTC)
 
 
@@ -46,6 +49,47 @@ def test_every_public_name_is_there():
     assert dir(heliotwin) == heliotwin.__all__
     with pytest.raises(AttributeError, match="no attribute 'open_plants'"):
         _ = heliotwin.open_plants
+
+
+def test_results_have_short_words_plots_and_tables():
+    """Arrays are neither printed nor tabled; a map is drawn in metres."""
+    mirror = Heliostat.juelich("AB12", (0.0, 50.0, 2.0), 50.0)
+    z = np.zeros((4, 8, 8))
+    z[0] += 1e-3
+    surface = heliotwin.Surface("AB12", "given", z, control_points(mirror, z))
+    light = np.ones((4, 6), np.float32) * 2e3
+    flux = heliotwin.Flux(light, (6.0, 4.0), 2e3, 48e3, None, None, (200.0, 45.0))
+    photograph = heliotwin.Photograph("101", "main", (200.0, 45.0), NOON, None, light)
+    compared = heliotwin.Comparison(photograph, light, 0.9, 4.0, True)
+    for one in (surface, flux, photograph, compared):
+        assert len(repr(one)) < 240
+        assert "array" not in repr(one)
+    table = heliotwin.to_frame([compared, compared])
+    assert list(table.accuracy) == [0.9, 0.9]
+    assert list(table.identifier) == ["101", "101"]
+    assert heliotwin.to_frame([surface]).heliostat[0] == "AB12"
+    effect = {"name": "slope_error", "parameters": {"x_mrad": {"value": 1.0, "ci95": (0.5, 1.5)}}}
+    study = heliotwin.StudyResult("effect", "", [effect], 0.8, 0.9, {})
+    assert study.parameters.iloc[0].tolist() == ["slope_error", "x_mrad", 1.0, 0.5, 1.5]
+    axes = Figure().subplots(1, 3)
+    assert surface.plot(ax=axes[0]) is axes[0]
+    heights = axes[0].images[0].get_array()
+    assert heights[:20, :20].max() == pytest.approx(1.0)  # the first facet is the upper left
+    assert np.nanmax(np.abs(heights[-20:])) == pytest.approx(0.0)
+    assert flux.plot(ax=axes[1]).images[0].get_extent() == [-3, 3, -2, 2]
+    assert axes[1].images[0].get_array().max() == pytest.approx(2.0)
+    photograph.plot(ax=axes[2])
+    assert "101" in axes[2].get_title()
+
+
+def test_the_field_is_drawn_from_above(plant):
+    assert "4 heliostats" in repr(plant)
+    axes = Figure().subplots()
+    assert plant.plot({"AB12": 0.9}, "accuracy", axes) is axes
+    hollow, coloured = axes.collections[:2]
+    assert (len(hollow.get_offsets()), len(coloured.get_offsets())) == (3, 1)
+    with pytest.raises(heliotwin.InvalidInputError, match="ZZ99"):
+        plant.plot({"ZZ99": 1.0})
 
 
 @pytest.mark.full
@@ -110,6 +154,7 @@ def test_power_scales_with_irradiance_and_the_spot_follows_the_aim(plant):
     assert half.center_of_mass_m[0] - full.center_of_mass_m[0] == pytest.approx(-1, abs=0.02)
 
 
+@pytest.mark.full
 def test_a_prediction_is_the_commands(plant, single_plant, tmp_path):
     out = written(tmp_path, "predict", single_plant)
     entry = json.loads((out / "predictions.json").read_text())["heliostats"]["AB12"]

@@ -1,5 +1,6 @@
 """The notebooks of ``docs/notebooks`` run from top to bottom on the demonstration's plant."""
 
+import json
 import runpy
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
+
+from docs import run_notebooks
 
 NOTEBOOKS = Path(__file__).parents[2] / "docs" / "notebooks"
 
@@ -34,6 +37,16 @@ def run(
 def test_all_are_run():
     tests = Path(__file__).read_text(encoding="utf-8")
     assert all(f'run("{path.stem}")' in tests for path in NOTEBOOKS.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", run_notebooks.NAMES)
+def test_outputs_are_those_of_the_script(name: str):
+    """`python -m docs.run_notebooks` records them again, after a change of the script."""
+    known = json.loads((NOTEBOOKS / f"{name}.json").read_text(encoding="utf-8"))
+    assert known["digest"] == run_notebooks.digest(name)
+    notebook = json.loads(run_notebooks.notebook(name))
+    outputs = [one for cell in notebook["cells"] for one in cell.get("outputs", ())]
+    assert any("image/png" in one.get("data", {}) for one in outputs)
 
 
 def test_surfaces_from_photographs(run):

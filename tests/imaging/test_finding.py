@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
+from heliotwin.demo.camera import CameraOptions, photograph, target_corners
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging import Camera, measure
 from model.imaging.edges import find_sheet
@@ -25,7 +26,6 @@ from model.locating import (
     project,
 )
 from model.plant import TargetPlane
-from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import accuracy
 
 PLAIN = CameraOptions(border=0.0, marks=False, daylight=0.45, peak=0.5)

@@ -3,13 +3,13 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from heliotwin.demo.camera import CameraOptions, photograph
 from model.errors import InvalidInputError
 from model.images import clipped_alike
 from model.imaging import Camera, center_of_mass, measure
 from model.imaging.light import LINEAR, Measured, Power, Srgb, camera_at, cameras_from_json
 from model.imaging.quality import SATURATED_GRAY, ceiling
 from model.metrics import flux_accuracy
-from service.cli.demo_camera import CameraOptions, photograph
 from tests.imaging import accuracy, gaussian
 
 CURVES = [Srgb(), LINEAR, Power(2.2), Measured((0.0, 0.4, 1.0), (0.0, 0.2, 1.0))]

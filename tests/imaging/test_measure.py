@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
+from heliotwin.demo.camera import CameraOptions, photograph, target_corners
 from model.errors import InvalidInputError
 from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
 from model.imaging.rectify import rectify
-from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from tests.imaging import accuracy, gaussian
 
 SIZE = (5.4, 6.4)

@@ -2,12 +2,12 @@ import cv2
 import numpy as np
 import pytest
 
+from heliotwin.demo.camera import CameraOptions, photograph, target_corners
 from model.errors import ImageRefusedError, InvalidInputError
 from model.imaging import Camera
 from model.imaging.marks import find_marks
 from model.imaging.rectify import check_corners, find_corners, rectify
 from model.plant import TargetPlane
-from service.cli.demo_camera import CameraOptions, photograph, target_corners
 from service.sources.juelich import mark_layouts
 
 ARM, STROKE = 0.74, 0.16  # [m]

@@ -169,13 +169,8 @@ RIVALS = {
 """Candidates of the studies, each with the parameter that is compared."""
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name == "slope_error" else pytest.param(name, marks=pytest.mark.full)
-        for name in RIVALS
-    ],
-)
+@pytest.mark.full
+@pytest.mark.parametrize("name", RIVALS)
 def test_an_effect_is_found_before_its_rivals(name):
     found = study_of(made(name))
     assert [one.name for one in found.found] == [name]
@@ -185,6 +180,7 @@ def test_an_effect_is_found_before_its_rivals(name):
     assert value == pytest.approx(truth, rel=0.15)
 
 
+@pytest.mark.full
 def test_a_tilt_about_east_is_found():
     """A vertical axis may lean to either side."""
     found = study_of(AxisTilt(east_deg=2.8), ("axis_tilt", "target_registration"))

@@ -209,6 +209,7 @@ def test_neighbours_that_are_left_out_hide_nothing():
             torch.testing.assert_close(clear(torch.tensor(some)[None], points, ray, cell), expected)
 
 
+@pytest.mark.full
 def test_blocking_and_shading_of_a_dense_field_against_monte_carlo():
     sun, plane = sun_direction(145.0, 15.0), target(9.0, (0.0, 0.0, 30.0))
     heliostats = field(5, 5, (3.8, 4.4), 55.0)

@@ -80,10 +80,12 @@ def test_known_neighbours_are_found_before_their_rivals():
     assert found.effects[0].share == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.full
 def test_no_false_alarm_if_neighbours_were_stowed():
     assert study(photographs(), MODEL, OPTIONS).found == []
 
 
+@pytest.mark.full
 def test_without_a_layout_they_are_no_candidate():
     alone = [replace(p, setup=replace(p.setup, neighbours=None)) for p in photographs()]
     found = study(alone, MODEL, replace(OPTIONS, candidates=("known_neighbours", "slope_error")))

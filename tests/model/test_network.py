@@ -33,7 +33,7 @@ from model.tracing.convolution import central_rays
 from service.twin.runtime import operations
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
-from training.render import Photographs, SceneSampler, Setups
+from training.render import Renderings, SceneSampler, Setups
 
 SMALL = NetworkConfig(channels=(8, 16, 16), features=32, hidden=32)
 
@@ -163,7 +163,7 @@ def test_a_descent_leads_towards_the_surface_that_threw_the_images():
         prior.surface(rng.normal(size=len(prior.basis)))[None], dtype=torch.float32
     )
     flux = setups.trace(truth)
-    seen = Photographs(setups, flux, torch.zeros_like(flux))
+    seen = Renderings(setups, flux, torch.zeros_like(flux))
     descent = seen.conjugate_gradient_steps(mean, basis)
     assert descent.shape == (1, 4, 4, 8, 8)
     misfit = [
@@ -229,7 +229,7 @@ def test_mirrored_geometry_has_mirrored_inputs():
         ]
         guess, thrower = (torch.as_tensor(values) for values in surfaces)
         flux = setups.trace(thrower)
-        photographs = Photographs(setups, flux, torch.zeros_like(flux))
+        photographs = Renderings(setups, flux, torch.zeros_like(flux))
         mask, shown, descent = (
             torch.ones(1, 3),
             photographs.trace(guess),
@@ -307,6 +307,7 @@ default_predictor()
 """
 
 
+@pytest.mark.full
 def test_runtime_of_the_network_keeps_no_id_and_has_nothing_to_send(tmp_path: Path):
     """With telemetry on it writes an id and a queue of events under the home folder, as soon as it
     is loaded.
@@ -337,6 +338,15 @@ def test_a_mirror_of_other_facets_is_refused_with_the_remedy_and_rendered_all_th
     assert flux.shape == (1, 64, 64)
     with pytest.raises(InvalidInputError, match="for 3 facets"):
         operations.render(three, [observation("a")], np.zeros((4, 8, 8)), JUELICH_MODEL)
+
+
+def test_the_network_answers_if_its_surface_is_the_better_one(monkeypatch):
+    heliostat, seen = flat_heliostat(focal_length=75.0), [observation("a"), observation("b")]
+    network = operations.predict(heliostat, seen, JUELICH_MODEL)
+    for is_better, method in ((True, "network"), (False, "refined")):
+        refined = replace(network, method="refined", is_start_better=is_better)
+        monkeypatch.setattr(operations, "refine", lambda *_, answer=refined, **__: answer)
+        assert operations.predict(heliostat, seen, JUELICH_MODEL, "refined").method == method
 
 
 @pytest.mark.parametrize("method", ["network", "refined"])

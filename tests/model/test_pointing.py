@@ -184,6 +184,7 @@ def test_measurements_left_out_lie_within_their_intervals(world):
     assert 0.84 < np.mean(inside) < 0.96  # 90 % of the plane's two directions
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("count", [6, 12, 30])
 def test_the_predicted_error_is_that_of_spots_of_other_days(world, count: int):
     """The fit's residuals are smaller, the more so the fewer measurements there are."""
@@ -336,6 +337,7 @@ def recorded_by(
     }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("minutes", [-1.0, 0.5, 20.0])
 def test_a_clock_that_goes_wrong_is_dated_and_measured(world, minutes):
     field, _, readings = world
@@ -563,6 +565,7 @@ def with_drives(heliostat: Heliostat, factor: float) -> Heliostat:
     return replace(heliostat, mount=Mount.juelich(drives, mirror_offset=(0, 0, 0.175)))
 
 
+@pytest.mark.full
 def test_kinds_of_drives_make_priors_of_their_own(world):
     """Those of a second kind stand straight, whatever those of the first do; one of a third has no
     others.
@@ -637,6 +640,7 @@ def test_mounts_without_actuators_are_refused():
         KinematicChain.of([bare])
 
 
+@pytest.mark.full
 def test_measurements_of_unknown_time_determine_parameters_but_no_changes():
     """Half of each heliostat's measurements lose their time, some of them from before a step and
     some from after.
@@ -666,6 +670,7 @@ def test_measurements_of_unknown_time_determine_parameters_but_no_changes():
     assert mount_from_json(document, "H01").n_undated == document["undated"] == 20
 
 
+@pytest.mark.full
 def test_order_of_measurements_without_times_changes_nothing():
     generator = np.random.default_rng(12)
     field, days = heliostats(3), np.linspace(0, 365, 30)

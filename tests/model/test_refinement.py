@@ -194,6 +194,7 @@ def test_a_foreign_image_is_named(heliostat, truth):
     assert not found.trusted
 
 
+@pytest.mark.full
 def test_poor_image_has_less_weight(refined, heliostat, truth):
     """One whose patches err by a tenth of the peak: the surface goes by the others, and says so."""
     taken = images(heliostat, truth)
@@ -226,6 +227,27 @@ def test_adopted_effects_are_not_taken_for_shape(heliostat, truth):
     assert surface_error(known.z, truth) < 0.8 * surface_error(
         refine(heliostat, seen, JUELICH_MODEL, options=options).z, truth
     )
+
+
+@pytest.mark.full
+def test_few_images_say_whether_the_start_was_better(heliostat, truth):
+    """Two photographs of AC43 left a refined surface farther from its deflectometry than the
+    network's was.
+    """
+    seen, far = (
+        images(heliostat, truth),
+        default_prior().surface(np.eye(len(default_prior().basis))[0] * 9),
+    )
+    options = RefinementOptions(with_half_samples=False)
+
+    def is_better(start: np.ndarray, count: int) -> bool:
+        return refine(
+            heliostat, seen[:count], JUELICH_MODEL, start, options=options
+        ).is_start_better
+
+    assert is_better(truth, 2)
+    assert not is_better(far, 6)
+    assert not is_better(truth, 1)
 
 
 def test_no_image_is_named(heliostat):

@@ -11,6 +11,8 @@ from model.effects import Always, ByDay, Effect, Since, acting, effect_from_json
 from model.effects.axis_tilt import AxisTilt
 from model.effects.blocking import Blocking
 from model.effects.camera_response import CameraResponse
+from model.effects.camera_shoulder import CameraShoulder
+from model.effects.encoder_offset import EncoderOffset
 from model.effects.facet_canting import FacetCanting
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
@@ -20,7 +22,8 @@ from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, conclude, study, study_to_json
 from model.study.judging import few_gain, find_end, split
 from model.study.parameters import ParameterVector, Term, copied
-from model.study.scopes import Span, best_span, single_heliostat_scopes, time_scopes
+from model.study.scope_search import most_promising
+from model.study.scopes import ScopeCandidate, Span, best_span, single_heliostat_scopes, time_scopes
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
 from tests.model.scenes import FIRST, photographs
@@ -267,6 +270,18 @@ def test_what_one_heliostat_has_is_fitted_to_its_photographs():
     assert not term.is_disjoint_from(term)
 
 
+def test_a_moved_target_does_not_hide_a_changed_camera():
+    camera, turned = Term(CameraShoulder, since=CHANGE), Term(EncoderOffset, since=CHANGE)
+    always = Term(CameraShoulder)
+    found = [
+        ScopeCandidate(turned, 1000.0),
+        ScopeCandidate(always, 20.0),
+        ScopeCandidate(camera, 10.0),
+        ScopeCandidate(Term(SunShapeEffect, since=CHANGE), 1.0),
+    ]
+    assert most_promising(found, [always]) == [camera, turned]
+
+
 def test_few_gains_are_worth_less():
     assert few_gain(np.array([0.05])).low <= 0
     assert few_gain(np.array([0.05, 0.01])).low < 0
@@ -287,10 +302,24 @@ def test_of_every_day_some_photographs_are_fitted_and_some_judge():
     assert fitted == judging == {p.taken_at for p in taken}
 
 
+def test_fits_see_days_after_those_that_surfaces_were_predicted_from():
+    taken = photographs(days=8)
+    last = sorted({p.taken_at for p in taken})[3]
+    seen = [replace(p, seen=p.taken_at <= last) for p in taken]
+    parts = split(seen)
+    assert not any(seen[row].seen for row in parts.held_out)
+    fitted, judging = (
+        {seen[row].taken_at for row in rows} for rows in (parts.fitted, parts.held_out)
+    )
+    assert fitted == {p.taken_at for p in taken}
+    assert judging == {p.taken_at for p in taken if p.taken_at > last}
+
+
 # --- what studies find
 # ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_nothing_comes_or_goes_in_calm_photographs():
     calm = study_to_json(found_in([], "sun_shape", "camera_response", "facet_canting"))
     assert calm["verdict"] == "none"
@@ -314,6 +343,7 @@ def test_recanted_mirror_is_found_with_its_date():
     assert effect_from_json(found).scope == Since(CHANGE, ("far",))
 
 
+@pytest.mark.full
 def test_changed_camera_is_found_with_its_date():
     report = study_to_json(
         found_in([CameraResponse(1.1, scope=Since(CHANGE))], "camera_response", "camera_blur")
@@ -328,6 +358,7 @@ def test_changed_camera_is_found_with_its_date():
     assert found["parameters"]["gamma"]["value"] == pytest.approx(1.1, abs=0.02)
 
 
+@pytest.mark.full
 def test_haze_of_a_week_is_found_with_begin_and_end():
     """Photographs of each third day; the haze acts on three of their days."""
     week = Since(date(2024, 6, 8), until=date(2024, 6, 15))
@@ -374,6 +405,7 @@ def test_a_rough_mirror_is_found_by_name(is_dated: bool):
     assert "<td>far</td>" in study_page(found, "a plant", FIGURE_SCALES)
 
 
+@pytest.mark.full
 def test_what_one_heliostat_is_known_to_have_another_may_have():
     """The declared one is not sought again, and the other one's is found beside it."""
     both = [ROUGH, SlopeError(1.5, scope=Always(("near",)))]
@@ -394,6 +426,7 @@ def test_a_mirror_that_is_canted_otherwise_is_found_by_name():
     assert list(found["parameters"]["x_mrad"]["value"]) == ["far"]
 
 
+@pytest.mark.full
 def test_what_is_always_there_is_not_dated():
     (found,) = study_to_json(found_in([SunShapeEffect(0.12)], "sun_shape", "camera_response"))[
         "effects"
@@ -411,3 +444,10 @@ def test_two_mirrors_recanted_on_different_days_are_both_found():
     found = study_to_json(found_in([CANTED, other], "facet_canting"))["effects"]
     scopes = {tuple(effect["scope"]["heliostats"]): effect["scope"]["since"] for effect in found}
     assert scopes == {("far",): "2024-06-16", ("near",): "2024-06-10"}
+
+
+def test_an_effect_by_day_ends_on_other_days():
+    hazy = SunShapeEffect(0.03, scope=ByDay(HAZY, date(2024, 6, 9)))
+    assert effect_from_json(effect_to_json(hazy)).scope == hazy.scope
+    at = [datetime(2024, 6, day, 9, tzinfo=UTC) for day in (7, 8, 9)]
+    assert [bool(acting([hazy], one, "far")) for one in (*at, None)] == [True, True, False, False]

@@ -304,7 +304,7 @@ TYPES = {
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, id=name, marks=[pytest.mark.full] if name == "round" else [])
+        pytest.param(kind, id=name, marks=[] if name == "polygon" else [pytest.mark.full])
         for name, kind in TYPES.items()
     ],
 )

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from service.cli.main import main
+from heliotwin.cli.main import main
 from tests.forked import ForkedProcess, Output, forked_process
 
 

@@ -435,12 +435,31 @@ def bare(app: FastAPI) -> Iterator[TestClient]:
         yield client
 
 
+@pytest.fixture(scope="session")
+def known_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data of a service that knows the tower and the heliostat AA39; copy it."""
+
+    def fill(root: Path) -> None:
+        with client_of(create_app(Settings(data_dir=root, **QUIET), FakeOperations())) as client:
+            _tell(client)
+
+    return made_once(tmp_path_factory, "known-store", fill)
+
+
+def _tell(client: TestClient) -> None:
+    assert client.put("/v1/plant", json=tower_document()).status_code == 200
+    known = client.put("/v1/heliostats/AA39", json=properties_document())
+    assert known.status_code == 201
+
+
 @pytest.fixture
-def client(bare: TestClient, tower: dict[str, Any], properties: dict[str, Any]) -> TestClient:
+def client(settings: Settings, app: FastAPI, known_store: Path) -> Iterator[TestClient]:
     """A service that knows a tower with two targets, and the heliostat AA39."""
-    assert bare.put("/v1/plant", json=tower).status_code == 200
-    assert bare.put("/v1/heliostats/AA39", json=properties).status_code == 201
-    return bare
+    shutil.copytree(known_store, settings.data_dir, dirs_exist_ok=True)
+    with client_of(app) as client:
+        if settings.database_url:  # of another file, or of PostgreSQL
+            _tell(client)
+        yield client
 
 
 @pytest.fixture(scope="session")
@@ -455,8 +474,7 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         **QUIET,
     )
     with client_of(create_app(settings, FakeOperations())) as client:
-        client.put("/v1/plant", json=tower_document())
-        client.put("/v1/heliostats/AA39", json=properties_document())
+        _tell(client)
 
         def state() -> list[str]:
             paths = (

@@ -96,7 +96,7 @@ def fill(stj: Path, folder: Path) -> None:
             "surface": "current",
         }
         assert client.post("/v1/forecasts", json=body).status_code == 201
-        study = run_job(client, "/v1/studies", candidates=CANDIDATES)
+        study = run_job(client, "/v1/jobs/studies", candidates=CANDIDATES)
         assert study["verdict"] == "effect", study
         path = f"/v1/studies/{study['study']}"
         assert client.get(path).json()["effects"][0]["scope"] == {"kind": "set"}

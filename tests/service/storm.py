@@ -9,9 +9,9 @@ from typing import Any, cast
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from heliotwin.demo.field import write_layout
 from model.ephemeris import sun_positions
 from service.base.settings import Settings
-from service.cli.demo_field import write_layout
 from service.sources.folder import read_folder
 from service.store.columns import now
 from service.twin.runtime.runtime import Runtime

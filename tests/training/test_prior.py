@@ -6,6 +6,7 @@ from tests.conftest import flat_heliostat
 from training.prior import generic_kind
 
 
+@pytest.mark.full
 def test_kind_of_facets_is_distinguished_from_mirrors():
     prior, kind = generic_prior(flat_heliostat().facet_frames[2]), FacetKind()
     rng = np.random.default_rng(0)

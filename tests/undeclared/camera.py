@@ -88,8 +88,16 @@ def _seen(
     """
     half = np.array([[target.width], [target.height]], dtype=np.float32) / 2
     power = power * (np.abs(hits) < half).all(axis=0)
+    place, shaded = world.mast
+    power = power * (1 - np.float32(shaded) * (np.abs(hits[0] - np.float32(place)) < 0.2))
     if world.blur_m:
         hits = hits + np.float32(world.blur_m) * rng.standard_normal(hits.shape, dtype=np.float32)
+    if world.side_blur_m:
+        sigma = np.float32(world.side_blur_m) * (hits[0] / half[0] + 0.5).clip(0, 1)
+        hits = hits + sigma * rng.standard_normal(hits.shape, dtype=np.float32)
+    if world.rolling_m:
+        sway = np.float32(world.rolling_m) * np.sin(2 * np.pi * hits[1] / np.float32(1.5))
+        hits = np.stack([hits[0] + sway, hits[1]]).astype(np.float32)
     scale_x, scale_y, shear, turn = world.registration
     if world.registration != (1.0, 1.0, 0.0, 0.0):
         cosine, sine = np.cos(np.radians(turn)), np.sin(np.radians(turn))
@@ -123,6 +131,9 @@ def _sensed(photons: Array, target: Target, world: World, rng: np.random.Generat
     )
     stray = _peak(photons) * (level + gradient_x * x - gradient_y * y[:, None])
     photons = photons + rng.poisson(stray.clip(min=0))
+    for right, up in world.hot:
+        row, column = int((0.5 - up / 2) * PIXELS), int((0.5 + right / 2) * PIXELS)
+        photons[row : row + 2, column : column + 2] += 0.3 * _peak(photons)
     share = (photons / _peak(photons)).clip(max=world.saturation) ** world.gamma
     return 1 - np.exp(-world.compression * share) if world.compression else share
 

@@ -33,6 +33,9 @@ TUBE = 0.4
 lower ones.
 """
 
+CAMERA = (0.0, 15.0, 40.0)
+"""Where the camera is: right, up and in front of each target [m]."""
+
 CHUNK = 1024
 """Mirror points whose rays are traced at a time: what fits into a core's cache."""
 
@@ -115,11 +118,15 @@ def _bent(places: Array, areas: Array, hessian: Array) -> tuple[Array, Array]:
     )
 
 
-def _facet(facet: Facet, tilt: Array, curvature: float, u: Array, v: Array) -> tuple[Array, Array]:
+def _facet(
+    facet: Facet, tilt: Array, curvature: float, seal: float, u: Array, v: Array
+) -> tuple[Array, Array]:
     """Points and area vectors of a facet in mirror coordinates at the grid ``u`` by ``v``; ``tilt``
-    (2,) [rad].
+    (2,) and the slope ``seal`` at its edges [rad].
     """
     heights, by_x, by_y = (values.ravel() for values in facet.surface(u, v))
+    edge_x, edge_y = np.meshgrid(u**9, v**9, indexing="ij")
+    by_x, by_y = by_x + seal * edge_x.ravel(), by_y + seal * edge_y.ravel()
     x, y = (
         axis.ravel() for axis in np.meshgrid(u * facet.half[0], v * facet.half[1], indexing="ij")
     )
@@ -156,15 +163,17 @@ class Exposure:
         cells.
         """
         tilts = 1e-3 * self._own(self.world.canting_mrad, 4, 2)
-        curvatures = self._own(self.world.curvature, 4)
+        upper = np.array([1.0, 1.0, 0.0, 0.0])
+        curvatures = self._own(self.world.curvature, 4) + upper * self.world.row_focus * self.warmth
         parts = []
         for part in zip(self.heliostat.facets, tilts, curvatures, strict=True):
             u, v = (
                 2 * (np.arange(side) + (0.5 if rng is None else rng.random(side))) / side - 1
                 for _ in "uv"
             )
-            parts.append(_facet(*part, u, v))
+            parts.append(_facet(*part, 1e-3 * self.world.seal_mrad, u, v))
         places, areas = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        places[:2] += self.world.gap_m / 2 * np.sign(places[:2])
         twist = 1e-3 * self.world.twist_mrad_m * self.warmth
         return Points(places, areas, np.repeat(np.arange(4), side**2)).bent(
             twist * np.array([[0.0, 1], [1, 0]])
@@ -173,7 +182,11 @@ class Exposure:
     def light(self, points: Points) -> Array:
         """Share (n,) of the light that points reflect and that nothing takes away."""
         line = (self._own(self.world.hidden) - 0.5) * self.heliostat.height
-        return self._own(self.world.reflectivity, 4)[points.facets] * (points.places[1] >= line)
+        light = self._own(self.world.reflectivity, 4)[points.facets] * (points.places[1] >= line)
+        middles = np.array([facet.position[1] for facet in self.heliostat.facets])
+        halves = np.array([facet.half[1] for facet in self.heliostat.facets])
+        lower = points.places[1] < (middles - halves / 3)[points.facets]
+        return np.asarray(light * (1 - self.world.dew * lower))
 
     def _own(self, values: Values, *shape: int) -> Array:
         """What belongs to this heliostat of a disturbance."""
@@ -287,10 +300,32 @@ def throw(
         first = rng.integers(sun.light.size - len(some) * fan)
         chosen = slice(first, first + len(some) * fan)
         suns = sun.directions[:, chosen].reshape(3, len(some), fan).transpose(1, 0, 2)
+        if exposure.world.flattened:
+            suns = _flattened(suns, exposure, frame)
         out = mirrors[some].astype(np.float32) @ suns
         hits = land(places[:, some, None].astype(np.float32), out.transpose(1, 0, 2))
         light = weight[some, None].astype(np.float32) * sun.light[chosen].reshape(len(some), fan)
+        if exposure.world.gloss:
+            light = light * (1 + exposure.world.gloss * _gloss(hits, out.transpose(1, 0, 2)))
         yield hits.reshape(2, -1), light.ravel()
+
+
+def _flattened(suns: Rays, exposure: Exposure, frame: Array) -> Rays:
+    """Directions (n, 3, m) of a sun that is flattened upwards, in the ``frame`` (3, 3)."""
+    low = np.exp(-np.degrees(np.arcsin(exposure.sun[2])) / 40)
+    up = unit((exposure.target.axes @ [0.0, 0.0, 1.0]) @ frame[:, :2])
+    rise = np.einsum("d,ndm->nm", up, suns[:, :2])
+    pressed = suns.copy()
+    pressed[:, :2] -= (exposure.world.flattened * low * up[:, None] * rise[:, None]).astype("f4")
+    return pressed
+
+
+def _gloss(hits: Rays, directions: Rays) -> Rays:
+    """Share (n, m) by which light (3, n, m) at hits (2, n, m) [m] shines to the camera."""
+    sight = np.stack([-hits[0], CAMERA[1] - hits[1], np.full_like(hits[0], CAMERA[2])])
+    sight /= np.linalg.norm(sight, axis=0)
+    mirrored = directions * np.array([1, 1, -1], dtype=np.float32)[:, None, None]
+    return np.asarray((mirrored * sight).sum(axis=0).clip(min=0) ** 40)
 
 
 def _swung(exposure: Exposure, side: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:

@@ -12,6 +12,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.folders import read_photographs
+from heliotwin.folder_store import open_folder
 from model.ephemeris import sun_angles_at
 from model.forecast import View, align
 from model.frames import sun_direction
@@ -19,7 +20,6 @@ from model.images import clipped_alike
 from model.metrics import compare_on_target
 from model.plant_model import JUELICH_MODEL
 from model.study import FluxImage
-from service.cli.folder_store import open_folder
 from service.sources.folder import MeasurementFolder, read_folder
 from tests.undeclared import changes, sky
 from tests.undeclared.adapter import effects_of, write_folder

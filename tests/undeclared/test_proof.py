@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotwin.folder_study import study_folder
 from model.effects import CATALOGUE
 from model.forecast import View, align
 from model.metrics import compare_on_target
 from model.plant_model import JUELICH_MODEL
 from model.study import StudyOptions, study, study_to_json
 from service.base.settings import FIGURE_SCALES
-from service.cli.folder_study import study_folder
 from service.drawing.study_report import study_page
 from service.sources.folder import read_folder
 from tests.undeclared import world
@@ -148,8 +148,18 @@ def test_a_drive_that_lost_steps_since_its_calibration_is_named_with_its_day():
         assert value == pytest.approx(made.truth[0]["parameters"][axis][heliostat], abs=0.05)
 
 
-def test_what_no_effect_describes_is_not_taken_for_nothing():
-    assert report("facet_focus")["verdict"] != "none"
+def test_what_no_effect_describes_is_a_discrepancy_that_corrects():
+    found = report("facet_focus")
+    assert found["verdict"] == "unexplained"
+    assert found["partly"] == [effect["name"] for effect in found["effects"]]
+    discrepancy = found["discrepancy"]
+    assert discrepancy["lives_in"] in (None, "mirror")
+    assert discrepancy["accuracy_after"] > found["before"]["accuracy_mean"] + 0.02
+    assert discrepancy["accuracy_gain"]["ci95"][0] > 0
+    assert {"kind", "name", "of", "unit", "value", "ci95", "per"} == set(
+        discrepancy["coefficients"][0]
+    )
+    assert discrepancy["in_words"] in found["conclusion"]
 
 
 def test_a_change_is_found_with_its_day(tmp_path):

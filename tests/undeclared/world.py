@@ -27,8 +27,8 @@ class World:
     Those of mirrors are one value for all, or arrays (heliostat,), (heliostat, facet) or, for
     ``canting_mrad``, (heliostat, facet, 2); ``encoder_deg`` (heliostat, 2) is what axes stand at
     beyond what encoders say. ``gamma``, ``saturation`` and ``compression`` bend the mirror's light
-    alone, ``law`` that of sheet and mirror together, on photographs. The last block is in no
-    catalogue.
+    alone, ``law`` that of sheet and mirror together, on photographs. The last two blocks are in no
+    catalogue; `UNSEEN` says what those of the last one are.
     """
 
     circumsolar_ratio: float = 0.02
@@ -56,6 +56,17 @@ class World:
     clouded: float = 0.0
     barrel: float = 0.0
     law: float = 1.0
+
+    row_focus: float = 0.0
+    gloss: float = 0.0
+    flattened: float = 0.0
+    gap_m: float = 0.0
+    rolling_m: float = 0.0
+    hot: tuple[tuple[float, float], ...] = ()
+    dew: float = 0.0
+    mast: tuple[float, float] = (0.0, 0.0)
+    seal_mrad: float = 0.0
+    side_blur_m: float = 0.0
 
 
 def _sign(rng: np.random.Generator) -> float:
@@ -204,6 +215,57 @@ def barrel_distortion(level: int, names: Sequence[str], rng: np.random.Generator
     return {"barrel": (0.1, 0.2, 0.35)[level]}, {}
 
 
+def row_focus(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """The upper row of facets bends [1/m] with a temperature, per standard deviation."""
+    return {"row_focus": _sign(rng) * (0.0005, 0.001, 0.002)[level]}, {}
+
+
+def glossy_target(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """The target is not Lambertian: it sends more light where a mirror in it would."""
+    return {"gloss": (2.0, 5.0, 12.0)[level]}, {}
+
+
+def flattened_sun(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Air flattens a low sun by a share, which falls with its elevation."""
+    return {"flattened": (0.3, 0.5, 0.8)[level]}, {}
+
+
+def facet_gap(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Facets are mounted farther apart than planned."""
+    return {"gap_m": (0.06, 0.12, 0.24)[level]}, {}
+
+
+def rolling_shutter(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Rows are read one after the other, while the camera vibrates."""
+    return {"rolling_m": (0.04, 0.08, 0.16)[level]}, {}
+
+
+def hot_pixels(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Places on the sensor, right and up in halves of the image, that are always bright."""
+    places = rng.uniform(-0.5, 0.5, ((40, 80, 160)[level], 2))
+    return {"hot": tuple(map(tuple, places.tolist()))}, {}
+
+
+def dew(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """Dew on the lower third of each facet takes a share of its light."""
+    return {"dew": (0.2, 0.4, 0.7)[level]}, {}
+
+
+def mast_shadow(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """The camera's mast shades a strip of the targets: place [m], and share of the light."""
+    return {"mast": (rng.uniform(-0.7, 0.7), (0.1, 0.2, 0.4)[level])}, {}
+
+
+def swollen_seal(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """The seal of facets swells and bends their edges."""
+    return {"seal_mrad": (0.5, 1.0, 2.0)[level]}, {}
+
+
+def side_blur(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
+    """A lens out of focus at its right side."""
+    return {"side_blur_m": (0.2, 0.3, 0.45)[level]}, {}
+
+
 def slight_tilt(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
     """Of a size that is visible by motor positions, but not by shapes, as in the next function."""
     size, turn = (0.1, 0.2, 0.4)[level], rng.uniform(0, 2 * np.pi)
@@ -247,6 +309,44 @@ OUTSIDE: dict[str, Draw] = {
 }
 
 
+UNSEEN: dict[str, Draw] = {
+    draw.__name__: draw
+    for draw in (
+        row_focus,
+        glossy_target,
+        flattened_sun,
+        facet_gap,
+        rolling_shutter,
+        hot_pixels,
+        dew,
+        mast_shadow,
+        swollen_seal,
+        side_blur,
+    )
+}
+"""Outside the catalogue, too; no threshold of the study was chosen by them."""
+
+
+LIVES_IN = {
+    "second_axis_wobble": "angle",
+    "facet_focus": "mirror",
+    "thermal_twist": "mirror",
+    "clouded_sun": "angle",
+    "barrel_distortion": "geometry",
+    "row_focus": "mirror",
+    "glossy_target": "target",
+    "flattened_sun": "angle",
+    "facet_gap": "mirror",
+    "rolling_shutter": "geometry",
+    "hot_pixels": "added_light",
+    "dew": "mirror",
+    "mast_shadow": "target",
+    "swollen_seal": "mirror",
+    "side_blur": "camera",
+}
+"""Where those outside the catalogue act."""
+
+
 MOVING: dict[str, tuple[str, Draw]] = {
     "slight_tilt": ("axis_tilt", slight_tilt),
     "slow_clock": ("sun_position", slow_clock),
@@ -265,7 +365,7 @@ def disturb(
     fields: dict[str, Any] = {}
     truth = []
     for name in [] if case == "clean" else case.split("+"):
-        effect, draw = MOVING.get(name) or (name, {**CATALOGUE, **OUTSIDE}[name])
+        effect, draw = MOVING.get(name) or (name, {**CATALOGUE, **OUTSIDE, **UNSEEN}[name])
         changed, parameters = draw(level, names, rng)
         fields |= changed
         if effect in CATALOGUE:

@@ -43,7 +43,7 @@ from service.base.fields import (
 from service.base.memory import return_memory
 from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
-from service.jobs.kinds.field_forecasts import Fleet, FleetForecastIn, expected_s
+from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
 from service.store.jobs import queue
 from service.store.tables import HeliostatRow
@@ -51,13 +51,15 @@ from service.twin.forecasts.aim_drives import AimDrives, no_drive
 from service.twin.forecasts.aim_sources import SOURCES, plant_time_zone, sources_of
 from service.twin.forecasts.aims import ROWS, aim_figures, begin_at, excess_of, places_on
 from service.twin.forecasts.field_forecast import (
+    Fleet,
     HeliostatGroup,
     TracedImages,
     forecast_group,
     group_warnings,
     trace_kernels,
 )
-from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
+from service.twin.forecasts.requests import position_of
 from service.twin.runtime.runtime import Runtime
 
 MAX_STEPS = 100
@@ -149,7 +151,7 @@ def _too_many_steps(count: int) -> str:
 class AimPlanIn(FleetForecastIn):
     """Find the aim points of the most power on a receiver under the flux that it can take.
 
-    In 95 % of draws of the pointing errors the whole map is within the limit. Heliostats are left
+    In 95 % of cases of the pointing errors the whole map is within the limit. Heliostats are left
     inactive only where no aims keep it. The aims are those for one sun, or for the steps of a day.
     """
 
@@ -269,6 +271,8 @@ def plan_field(context: Context, payload: AimPlanIn) -> Result:
     with runtime.database.reading() as session:
         drives = AimDrives.read(session, names, fleet.model)
         sources = sources_of(session, names, payload.model_version)
+    if fleet.states is not None:
+        sources["states"] = {name: fleet.states.values_of(name) for name in names}
     done = context.steps()
     if SOURCES not in done:
         with runtime.database.writing() as session:

@@ -2,49 +2,38 @@
 
 import pickle
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from hashlib import sha256
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from model.fleet import LOSSES, FleetFlux, Losses
-from model.frames import sun_direction
-from model.plant import Receiver, Tower
+from model.plant import Receiver
 from service import store
-from service.base.fields import (
-    AnySun,
-    Flag,
-    Model,
-    ModelVersion,
-    Name,
-    Plane,
-    Position,
-    Resolution,
-    Sun,
-)
-from service.base.receivers import ReceiverIn
+from service.base.fields import AnySun, Flag, ModelVersion, Name, Position, Resolution
 from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.store.jobs import queue
 from service.twin.alarms.measured_states import read_mirror_states
 from service.twin.forecasts.field_forecast import (
     Checkpoint,
+    Fleet,
     HeliostatGroup,
     forecast_group,
     group_warnings,
 )
-from service.twin.forecasts.heliostat_forecast import position_of, receiver_as_json
-from service.twin.forecasts.mirror_states import MirrorStates, with_measured
-from service.twin.forecasts.watts import Sunlight, dni_of, field_watts, heliostat_watts
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
+from service.twin.forecasts.mirror_states import with_measured
+from service.twin.forecasts.requests import ReceiverChoice, position_of
+from service.twin.forecasts.watts import Sunlight, field_watts, heliostat_watts
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
 
 
-class FleetIn(Model):
+class FleetIn(ReceiverChoice):
     """Heliostats, their common receiver, and their aim points."""
 
     heliostats: Heliostats = Field(
@@ -53,15 +42,6 @@ class FleetIn(Model):
             "Names; all of the plant if not given, or those that its layout gives to the receiver."
             " The others cast shadows."
         ),
-    )
-    target: Name | None = Field(
-        default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
-    )
-    plane: Plane | None = Field(
-        default=None, description="Any plane; either this, `target` or `receiver`."
-    )
-    receiver: ReceiverIn | None = Field(
-        default=None, description="Any receiver; either this, `target` or `plane`."
     )
     aim_point_m: Position | None = Field(
         default=None,
@@ -93,41 +73,25 @@ class FleetIn(Model):
     resolution: Resolution = (256, 256)
     model_version: ModelVersion = None
 
-    @model_validator(mode="after")
-    def _one(self) -> Self:
-        if sum(value is not None for value in (self.target, self.plane, self.receiver)) != 1:
-            raise ValueError("give either target or plane, or receiver")
-        return self
-
-    def on(self, session: Session) -> Receiver:
-        """The receiver or target plane."""
-        if self.plane is not None:
-            return self.plane.named("plane")
-        if self.receiver is not None:
-            return self.receiver.named("receiver")
-        assert self.target is not None  # the schema requires one of the three
-        return store.get_target_or_receiver(session, self.target)
-
-    def fleet(self, runtime: Runtime) -> "Fleet":
+    def fleet(self, runtime: Runtime) -> Fleet:
         """The heliostats as the store has them now."""
         names = chosen_names(runtime, self.heliostats)
         with runtime.database.reading() as session:
             receiver = self.on(session)
             model = model_versions.get_model(session, self.model_version)
             tower = store.stored_tower(session)
-            altitude = store.get_plant(session).altitude_m
             around = self._around(session)
         lit = [name for name in names if name not in around]
         return Fleet(
-            self,
-            lit,
-            receiver,
-            model,
-            self.aim_points_m,
-            tower,
-            altitude,
-            around,
-            read_mirror_states(runtime, lit) if self.measured_states else None,
+            names=lit,
+            receiver=receiver,
+            model=model,
+            sunlight=self.dni_w_m2,
+            aim=self.aim_point_m,
+            aims=self.aim_points_m,
+            tower=tower,
+            states=read_mirror_states(runtime, lit) if self.measured_states else None,
+            around=around,
         )
 
     def _around(self, session: Session) -> dict[str, Receiver]:
@@ -140,40 +104,6 @@ class FleetIn(Model):
             return {}
         goals = {goal: store.get_target_or_receiver(session, goal) for goal in set(given.values())}
         return {name: goals[goal] for name, goal in given.items() if goal != self.target}
-
-
-@dataclass(frozen=True, eq=False)
-class Fleet:
-    """The heliostats of a request, read once for all suns; see `HeliostatGroup`.
-
-    ``altitude`` is the plant's [m].
-    """
-
-    request: FleetIn
-    names: Sequence[str]
-    receiver: Receiver
-    model: model_versions.ModelVersion
-    aims: Mapping[str, Sequence[float]]
-    tower: Tower | None
-    altitude: float
-    around: Mapping[str, Receiver]
-    states: MirrorStates | None
-
-    def under(self, sun: Sun, ideal: bool) -> HeliostatGroup:
-        """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
-        aim, sunlight = self.request.aim_point_m, self.request.dni_w_m2
-        return HeliostatGroup(
-            names=self.names,
-            receiver=self.receiver,
-            sun=sun_direction(sun.azimuth_deg, sun.elevation_deg),
-            model=self.model.with_dni(dni_of(sunlight, sun.elevation_deg, self.altitude)),
-            aim=None if aim is None else np.array(aim),
-            aims=self.aims,
-            ideal=ideal,
-            tower=self.tower,
-            around=self.around,
-            states=None if ideal else self.states,
-        )
 
 
 class FleetForecastIn(FleetIn):

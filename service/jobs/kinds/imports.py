@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from service.base.errors import ConflictError
 from service.base.fields import Model, Text
-from service.base.progress import Steps
+from service.base.progress import NamedSteps
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.uploads import content_of, find_upload, import_of
@@ -112,7 +112,7 @@ def _import(context: Context, folder: MeasurementFolder) -> Result:
         for name in folder.plant.heliostats
         for item in folder.measurements(name, False)
     ]
-    steps = Steps(
+    steps = NamedSteps(
         len(folder.plant.heliostats) + sum(images), context.report, "heliostats and images"
     )
     imported = Imported()

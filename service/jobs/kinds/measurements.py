@@ -1,16 +1,22 @@
 """The job `measurements`: re-measure stored photographs with the current cameras and version."""
 
 from collections.abc import Mapping
-from typing import Any, TypedDict
+from typing import Any, TypedDict, get_args
 
 from pydantic import Field
 
 from service import store
-from service.base.errors import SKIPPED, GoneError
+from service.base.choices import Method
+from service.base.errors import SKIPPED, ConflictError, GoneError
 from service.base.fields import Model, Reason
 from service.jobs.common import Heliostats, chosen_names, require_some
+from service.jobs.enqueuing import enqueue
 from service.jobs.kind import Context, Kind, Result
+from service.jobs.kinds import predictions
+from service.jobs.kinds.predictions import PredictionsIn
 from service.twin.photographs.corrections import remeasure
+from service.twin.plant import model_versions
+from service.twin.runtime.runtime import Runtime
 
 
 class MeasurementsIn(Model):
@@ -19,6 +25,14 @@ class MeasurementsIn(Model):
     This is useful after a camera was declared or heliotwin was updated. Each photograph's history
     records what changed. Surfaces from these photographs remain until they are predicted again.
     """
+
+    camera: model_versions.CameraAnswer | None = Field(
+        default=None,
+        description=(
+            "First declare what images without background are: srgb, differences of sRGB counts as"
+            " PAINT's, or linear light. Afterwards surfaces are predicted again."
+        ),
+    )
 
     heliostats: Heliostats = None
     reason: Reason = Field(
@@ -41,6 +55,11 @@ def measure_many(context: Context, payload: MeasurementsIn) -> Result:
     After a restart the job continues with the remaining ones.
     """
     names, done = chosen_names(context.runtime, payload.heliostats), context.steps()
+    if payload.camera is not None and not done:
+        with context.runtime.database.writing() as session:
+            model_versions.declare_camera(
+                session, payload.camera, context.created_by, payload.reason
+            )
     for index, name in enumerate(names):
         context.report(
             index / len(names), name, phase="heliostats", n_done=index, n_total=len(names)
@@ -53,7 +72,27 @@ def measure_many(context: Context, payload: MeasurementsIn) -> Result:
                 context.keep(session, name, step)
     figures = counts(context.steps())
     require_some(figures["measured"] + figures["gone"], figures["skipped"])
+    if payload.camera is not None:
+        _predict_again(context)
     return Result(figures)
+
+
+def _predict_again(context: Context) -> None:
+    """Queue predictions of active surfaces that another version of the model made."""
+    with context.runtime.database.reading() as session:
+        outdated = store.outdated_surfaces(session, model_versions.current_version(session))
+    for method in get_args(Method):  # that of the active surface
+        names = [one.heliostat for one in outdated if one.source == method and not one.waits]
+        if names:
+            payload, key = PredictionsIn(heliostats=names, method=method), context.lease.job_id
+            by = context.created_by
+            enqueue(context.runtime, predictions.KIND, payload, by, f"after-{key}-{method}")
+
+
+def _require_undeclared(payload: MeasurementsIn, runtime: Runtime) -> None:
+    with runtime.database.reading() as session:
+        if payload.camera is not None and model_versions.declares_camera(session):
+            raise ConflictError("camera: the plant's model declares its cameras already")
 
 
 def counts(steps: Mapping[str, Mapping[str, Any]]) -> Remeasured:
@@ -103,4 +142,5 @@ KIND = Kind(
     measure_many,
     "Measure stored photographs again, by the current cameras.",
     so_far=counts,
+    require=_require_undeclared,
 )

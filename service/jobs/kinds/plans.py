@@ -19,8 +19,13 @@ from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, T
 from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.aim_plans import PlannedAims
-from service.jobs.kinds.field_forecasts import Fleet, FleetIn, expected_s
-from service.twin.forecasts.field_forecast import HeliostatGroup, forecast_group, group_warnings
+from service.jobs.kinds.field_forecasts import FleetIn, expected_s
+from service.twin.forecasts.field_forecast import (
+    Fleet,
+    HeliostatGroup,
+    forecast_group,
+    group_warnings,
+)
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import FieldWatts, field_watts
 from service.twin.runtime.runtime import Runtime

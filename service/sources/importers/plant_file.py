@@ -46,7 +46,7 @@ class MeasurementProperties(WeatherDocument):
 
 
 @dataclass(frozen=True, eq=False)
-class PlantFolder(MeasurementFolder):
+class PlantFileFolder(MeasurementFolder):
     """A folder with ``plant.yaml`` at its root.
 
     Attributes
@@ -56,7 +56,7 @@ class PlantFolder(MeasurementFolder):
 
     description: PlantDescription = field(kw_only=True)
 
-    def whole_field(self) -> "PlantFolder":
+    def whole_field(self) -> "PlantFileFolder":
         """The folder with every heliostat of the layout."""
         every = self.description.plant.heliostats
         properties = _properties(self.description, every)
@@ -118,7 +118,7 @@ def _declared(description: PlantDescription) -> dict[str, object]:
     return {"sun": sun_to_json(optics.sun_shape), "optics": optics_to_json(optics)}
 
 
-def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
+def _read(root: Path, heliostats: list[str] | None) -> PlantFileFolder:
     description = read_plant(root / PLANT)
     plant = description.plant
     kept = {
@@ -131,7 +131,7 @@ def _read(root: Path, heliostats: list[str] | None) -> PlantFolder:
     whole = Plant(plant.name, plant.origin, plant.targets, kept, plant.receivers)
     properties = _properties(description, kept)
     facts = PlantFacts(description.tower, description.time_zone, types_to_json(root / PLANT))
-    return PlantFolder(root, whole, model, {}, properties, facts=facts, description=description)
+    return PlantFileFolder(root, whole, model, {}, properties, facts=facts, description=description)
 
 
 def _properties(

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from service.base.names import NAME, require_name
+from service.sources.folder import MeasuredSurface
 from service.sources.hdf5 import Hdf5Group, open_hdf5
 from service.sources.plant_formats.artist_axes import TILTS, TRANSLATIONS, RigidBody, rigid_body
-from service.sources.plant_formats.artist_mirrors import ArtistMirror, MirrorDesign, design_of
-from service.sources.plant_formats.imported import ImportedPlant, MeasuredSurface, placed, site
+from service.sources.plant_formats.artist_mirrors import ArtistMirror
+from service.sources.plant_formats.imported import ImportedPlant, placed, plant_name, site
+from service.sources.plant_formats.mirror_design import MirrorDesign, design_of
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry
 
 Array = NDArray[np.float64]
@@ -30,8 +32,10 @@ _MAX_TYPES = 64
 _LEVEL = 1e-4
 
 
-def read_artist(path: Path) -> ImportedPlant:
+def read_artist(path: Path, parameters_are_positions: bool = False) -> ImportedPlant:
     """Read a scenario of ARTIST.
+
+    ``parameters_are_positions`` is that of `model.surface.heights`.
 
     Raises
     ------
@@ -46,7 +50,7 @@ def read_artist(path: Path) -> ImportedPlant:
             )
         if "heliostats" not in data or "prototypes" not in data:
             raise data.refuse("is no scenario of ARTIST: 'heliostats' or 'prototypes' is missing")
-        return _Scenario(data, path.stem).plant()
+        return _Scenario(data, path.stem, parameters_are_positions).plant()
 
 
 class _Kinematics(NamedTuple):
@@ -72,6 +76,7 @@ class _Scenario:
 
     data: Hdf5Group
     name: str
+    parameters_are_positions: bool = False
     notes: list[str] = field(default_factory=list)
     left_out: dict[str, float] = field(default_factory=dict)
 
@@ -89,9 +94,11 @@ class _Scenario:
         for name, one in members.items():
             require_name(NAME, name, f"{one.place}: heliostat")
             kinematics = self._kinematics(one, prototypes)
-            mirror = _mirror(_part("surface", one, prototypes), kinematics.body)
-            design, focal_length = design_of(mirror)
-            if mirror.is_measured:
+            mirror = _mirror(
+                _part("surface", one, prototypes), kinematics.body, self.parameters_are_positions
+            )
+            design, focal_length = design_of(mirror.facets)
+            if mirror.surface is not None:
                 surfaces[name] = mirror.surface
             foot = _vector(one, "position") + kinematics.body.joint * [1.0, 1.0, 0.0]
             height, offset = kinematics.body.joint[2], kinematics.body.mirror_offset
@@ -121,7 +128,7 @@ class _Scenario:
     ) -> ImportedPlant:
         position = self.data.group("power_plant").numbers("position", (3,), 3)
         parts: dict[str, object] = {
-            "plant": site(_name_of(self.name), tuple(position.tolist()), "UTC"),
+            "plant": site(plant_name(self.name, "artist"), tuple(position.tolist()), "UTC"),
             "heliostat_types": {name: _entry(key, name) for key, name in types.items()},
         }
         if areas.receivers:
@@ -144,6 +151,13 @@ class _Scenario:
             self.notes.append(
                 f"surfaces: {len(surfaces)} heliostats have measured ones, in H/Deflectometry;"
                 " heliotwin field takes them with --surfaces and this folder."
+            )
+            self.notes.append(
+                "surfaces: read as fits of deflectometry, a parameter is a position; without"
+                " --parameters-are-positions a spline is its geometry."
+                if self.parameters_are_positions
+                else "surfaces: a spline is its geometry, as ARTIST traces it;"
+                " --parameters-are-positions reads them as fits of deflectometry."
             )
         self.notes += [
             "sun: the number of rays is left out; light is convolved here.",
@@ -231,8 +245,10 @@ def _exact(value: float) -> float:
 
 
 def _part(name: str, one: Hdf5Group, prototypes: Hdf5Group) -> Hdf5Group:
-    """A heliostat's part, or the prototype's."""
-    return (one if name in one else prototypes).group(name)
+    """A heliostat's part, or the prototype's; ARTIST 1.x has ``kinematic``, without an s."""
+    owners = ((owner, known) for known in (name, name.rstrip("s")) for owner in (one, prototypes))
+    owner, known = next(((o, k) for o, k in owners if k in o), (prototypes, name))
+    return owner.group(known)
 
 
 def _vector(group: Hdf5Group, name: str) -> Array:
@@ -242,12 +258,6 @@ def _vector(group: Hdf5Group, name: str) -> Array:
     if not np.isfinite(values).all():
         raise group.refuse(f"'{name}' must be finite")
     return values[:3]
-
-
-def _name_of(stem: str) -> str:
-    """A plant's name of a file's."""
-    text = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in stem)[:32]
-    return text.lstrip("-_") or "artist"
 
 
 def _facets_file(name: str) -> str:
@@ -262,13 +272,7 @@ def _entry(key: _TypeKey, name: str) -> dict[str, object]:
     }
     if key.drives is not None:
         mount["drives"] = [dict(drive) for drive in key.drives]
-    focus = key.design.focus
-    return {
-        "mount": mount,
-        "facets": {"file": _facets_file(name)},
-        "facet_shape": focus if isinstance(focus, str) else {"focal_length_m": focus},
-        "canting": key.design.canting,
-    }
+    return {"mount": mount, "facets": {"file": _facets_file(name)}, **key.design.entries}
 
 
 # --- sun and target areas
@@ -292,6 +296,9 @@ def _sun(data: Hdf5Group) -> dict[str, object]:
     return {"shape": "gaussian", "sigma_mrad": float(f"{1e3 * np.sqrt(variance):.9g}")}
 
 
+_AREAS_1 = "target_areas"
+
+
 class _TargetAreas:
     """Receivers and targets; those that plant.yaml cannot have are named in the notes."""
 
@@ -308,11 +315,22 @@ class _TargetAreas:
             if found is not None:
                 (self.receivers if name == "receiver" else self.targets)[name] = found
         if not self.receivers and not self.targets:
-            raise data.refuse("has no target area that a plant can have; see target_areas_planar")
+            groups = [name for name in data.names if name.startswith(_AREAS_1)]
+            raise data.refuse(
+                f"has no target area that a plant can have in {' or '.join(groups) or _AREAS_1}:"
+                " an upright plane that faces north or south, or an upright cylinder."
+                f" {' '.join(self.notes)}".rstrip()
+            )
 
     def _areas(self, data: Hdf5Group, kind: str) -> dict[str, Hdf5Group]:
         group = f"target_areas_{kind}"
         areas = data.group(group).groups() if group in data else {}
+        if kind == "planar" and _AREAS_1 in data:
+            for name, area in data.group(_AREAS_1).groups().items():
+                if area.text("geometry") == kind:
+                    areas[name] = area
+                else:
+                    self._leave_out(area, f"is a {area.text('geometry')} of ARTIST 1.x")
         for name, area in areas.items():
             require_name(NAME, name, f"{area.place}: target area")
             if name in self.receivers or name in self.targets:
@@ -363,11 +381,7 @@ def _rounded(vector: Array) -> list[float]:
     return [_exact(value) + 0.0 for value in vector.tolist()]
 
 
-# --- mirrors
-# --------------------------------------------------------------------------------------------------
-
-
-def _mirror(surface: Hdf5Group, body: RigidBody) -> ArtistMirror:
+def _mirror(surface: Hdf5Group, body: RigidBody, parameters_are_positions: bool) -> ArtistMirror:
     """The mirror of a heliostat in our mirror coordinates."""
     facets = list(surface.group("facets").groups().values())
     if not 0 < len(facets) <= MAX_FACETS:
@@ -388,6 +402,7 @@ def _mirror(surface: Hdf5Group, body: RigidBody) -> ArtistMirror:
     centers = np.array([_vector(facet, "position") for facet in facets])
     sides = np.array([facet.numbers("canting", (2, 4), 8)[:, :3] for facet in facets])
     try:
-        return ArtistMirror.of(centers, sides, points, int(degree), body.mirror)
+        spline = MeasuredSurface(points, int(degree), parameters_are_positions)
+        return ArtistMirror.of(centers, sides, spline, body.mirror)
     except InvalidInputError as error:
         raise surface.refuse(str(error)) from None

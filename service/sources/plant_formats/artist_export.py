@@ -6,7 +6,6 @@ Source: ARTIST 2.0, ``docs/scenario.rst``, ``artist.io.h5_scenario_parser`` and
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -18,7 +17,7 @@ from model.plant import Cylinder, Heliostat, TargetPlane
 from model.sunshape import Gaussian, SunShape
 from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from service.sources.files import file_name
-from service.sources.folder import read_surface
+from service.sources.folder import MeasuredSurface, read_surface
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.artist_axes import deviations_of, rigid_body
 
@@ -32,11 +31,6 @@ _LEVEL = 1e-6
 _ANY_ANGLE = (-np.pi, np.pi)
 
 _Members = Mapping[str, object]
-
-
-class _Surface(NamedTuple):
-    points: Array
-    degree: int
 
 
 def write_artist(described: PlantDescription, out: Path, surfaces: Path | None) -> list[str]:
@@ -100,14 +94,14 @@ class _ScenarioWriter:
 
     # --- heliostats
 
-    def _surfaces(self, folder: Path | None) -> dict[str, _Surface]:
+    def _surfaces(self, folder: Path | None) -> dict[str, MeasuredSurface]:
         """Measured surfaces, and nominal ones on a grid of the same size."""
         found = {}
         if folder is not None:
             for name, one in self.heliostats.items():
                 surface = read_surface(folder, one)
                 if surface is not None:
-                    found[name] = _Surface(*surface)
+                    found[name] = surface
         kinds = {(one.points.shape[1:3], one.degree) for one in found.values()}
         if len(kinds) > 1:
             raise InvalidInputError(
@@ -123,7 +117,7 @@ class _ScenarioWriter:
         for name, one in self.heliostats.items():
             if name not in found:
                 zeros = np.zeros((len(one.facets), *shape))
-                found[name] = _Surface(control_points(one, zeros), DEGREE)
+                found[name] = MeasuredSurface(control_points(one, zeros), DEGREE)
         return found
 
     def _require_equal_mirrors(self) -> None:

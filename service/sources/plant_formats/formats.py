@@ -3,13 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_direction
-from service.sources.plant_file import PlantDescription
+from service.sources.files import file_name
+from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.artist import read_artist
 from service.sources.plant_formats.artist_export import write_artist
 from service.sources.plant_formats.imported import ImportedPlant
@@ -18,14 +20,16 @@ from service.sources.plant_formats.positions import has_positions, read_position
 from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
 from service.sources.plant_formats.soltrace import read_soltrace
 from service.sources.plant_formats.soltrace_export import soltrace_text
-from service.sources.plant_formats.text import read_lines
+from service.sources.text_lines import read_csv
 
 Array = NDArray[np.float64]
 
 
-def read_foreign(path: Path) -> ImportedPlant:
+def read_foreign(path: Path, parameters_are_positions: bool = False) -> ImportedPlant:
     """Read a file of SolTrace (``.stinput``), ARTIST (``.h5``), or a CSV by its first line:
     OpenCSP, SolarPILOT, or positions.
+
+    ``parameters_are_positions`` says how ARTIST's splines are read, as of `model.surface.heights`.
 
     Raises
     ------
@@ -35,11 +39,35 @@ def read_foreign(path: Path) -> ImportedPlant:
     if path.suffix.lower() == ".stinput":
         return read_soltrace(path)
     if path.suffix.lower() in (".h5", ".hdf5"):
-        return read_artist(path)
-    lines = read_lines(path, ",")
-    if lines and [cell.strip() for cell in lines[0].cells[:5]] == list(COLUMNS[:5]):
+        return read_artist(path, parameters_are_positions)
+    lines = read_csv(path)
+    if not lines:
+        raise InvalidInputError(f"{path}: is empty")
+    if list(lines[0].cells[:5]) == list(COLUMNS[:5]):
         return read_opencsp(path)
-    return read_positions(path) if lines and has_positions(lines[0]) else read_solarpilot(path)
+    return read_positions(path) if has_positions(lines[0]) else read_solarpilot(path)
+
+
+def import_plant(
+    path: Path, out: Path, parameters_are_positions: bool = False
+) -> tuple[ImportedPlant, list[Path]]:
+    """Read a file of another program, write its plant into the folder ``out``, and return the
+    paths.
+
+    Raises
+    ------
+    InvalidInputError
+        As of `read_foreign`; or if it makes no plant, or a file exists. Nothing is written then.
+    """
+    imported = read_foreign(path, parameters_are_positions)
+    with TemporaryDirectory() as name:
+        trial = Path(name)
+        try:
+            read_plant(imported.write(trial)[0])
+        except InvalidInputError as error:
+            problem = str(error).replace(f"{trial}/", "")
+            raise InvalidInputError(f"{file_name(path)}: makes no plant: {problem}") from None
+    return imported, imported.write(out)
 
 
 @dataclass(frozen=True)

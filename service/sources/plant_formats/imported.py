@@ -13,22 +13,13 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.site import Origin, Site
+from service.sources.folder import MeasuredSurface
 from service.sources.plant_schema import HeliostatEntry
+from service.sources.text_lines import ForeignLine
 
 Array = NDArray[np.float64]
 
 PLANT, LAYOUT, AIMS = "plant.yaml", "layout.csv", "aims.csv"
-
-
-class MeasuredSurface(NamedTuple):
-    """Control points (F, I, J, 3) [m] of a mirror in its coordinates, and the splines' degree."""
-
-    points: Array
-    degree: int
-
-    def write(self, path: Path) -> None:
-        """Write it as ``H-nurbs-surface.npz``."""
-        np.savez_compressed(path, control_points=self.points, degrees=np.full(2, self.degree))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,3 +157,32 @@ def site(name: str, origin: Origin, time_zone: str) -> dict[str, object]:
     """The part ``plant`` of plant.yaml."""
     keys = [entry.name for entry in fields(Site)]
     return {"name": name, **dict(zip(keys, origin, strict=True)), "time_zone": time_zone}
+
+
+def plant_name(stem: str, otherwise: str) -> str:
+    """A plant's name of a file's."""
+    text = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in stem)[:32]
+    return text.lstrip("-_") or otherwise
+
+
+def facing(
+    places: Sequence[tuple[float, float]], center: Sequence[float] = (0.0, 0.0)
+) -> list[int]:
+    """The normal (3,) of an upright plane at ``center`` [m] that faces a field, north or south if
+    the field does not say it: along or between east and north.
+    """
+    east, north = np.mean(np.array(places) - np.array(center[:2]), axis=0)
+    if np.hypot(east, north) < 1.0:
+        return [0, 1, 0]
+    step = np.round(np.arctan2(east, north) / (np.pi / 4)) * (np.pi / 4)
+    return [int(np.round(np.sin(step))), int(np.round(np.cos(step))), 0]
+
+
+def require_unique(lines: Sequence[ForeignLine], column: int) -> None:
+    """Refuse a name that occurs twice in a column; names the second line."""
+    seen: dict[str, str] = {}
+    for line in lines:
+        name = line.cells[column] if column < len(line.cells) else ""
+        if name in seen:
+            raise line.refuse(f"name {name[:60]!r} is that of {seen[name]}; rename one of them")
+        seen[name] = line.place.rpartition(", ")[2]

@@ -10,9 +10,15 @@ from pathlib import Path
 
 from model.errors import InvalidInputError
 from service.base.names import NAME, require_name
-from service.sources.plant_formats.imported import ImportedPlant, placed, site
-from service.sources.plant_formats.text import ForeignLine, read_lines
+from service.sources.plant_formats.imported import (
+    ImportedPlant,
+    facing,
+    placed,
+    require_unique,
+    site,
+)
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
+from service.sources.text_lines import ForeignLine, read_csv
 
 COLUMNS = (
     "Name",
@@ -40,13 +46,14 @@ def read_opencsp(path: Path) -> ImportedPlant:
     InvalidInputError
         It names file and line of what is not understood.
     """
-    lines = read_lines(path, ",", MAX_HELIOSTATS)
-    if not lines or [cell.strip() for cell in lines[0].cells] != list(COLUMNS):
+    lines = read_csv(path, MAX_HELIOSTATS)
+    if not lines or list(lines[0].cells) != list(COLUMNS):
         raise InvalidInputError(f"{path}, line 1: must be {','.join(COLUMNS)}")
     kinds: dict[tuple[float, ...], str] = {}
+    require_unique(lines[1:], 0)
     heliostats: list[HeliostatEntry] = []
     for line in lines[1:]:
-        name = line.cells[0].strip()
+        name = line.cells[0]
         require_name(NAME, name, f"{line.place}: Name")
         mirror = tuple(line.numbers(4, 7))
         _require_grid(line)
@@ -61,7 +68,7 @@ def read_opencsp(path: Path) -> ImportedPlant:
                 "main": {
                     "kind": "plane",
                     "center_m": [0, 0, 60],
-                    "normal": [0, 1, 0],
+                    "normal": facing([(h.east_m, h.north_m) for h in heliostats]),
                     "width_m": 6.0,
                     "height_m": 6.0,
                 }
@@ -69,12 +76,12 @@ def read_opencsp(path: Path) -> ImportedPlant:
         },
         heliostats=heliostats,
         notes=(
-            "The file has positions, mounts and mirrors. The rest is assumed; change it to yours.",
+            "Assumed, for the file has positions, mounts and mirrors only; change it to yours:",
             "plant: the National Solar Thermal Test Facility; positions as in the file.",
             "heliostat_types: flat facets, canted to the slant range; reflectance 1, no errors.",
             f"facets: gaps of {_GAP_M:g} m, as between the inner columns of the NSTTF's mirrors.",
             "layout: feet are one pivot height below the torque tube.",
-            "receivers: a plane 60 m up that faces north.",
+            "receivers: a plane 60 m up that faces the field.",
         ),
     )
 

@@ -7,61 +7,46 @@ Source: NREL, SolTrace, input files of version 2012.7.6; Wendelin, *SolTRACE: a 
 tool for concentrating solar optics*, ISEC 2003, doi:10.1115/ISEC2003-44090.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.sources.files import file_name
+from service.base.names import NAME
+from service.sources.files import file_name, read_text
 from service.sources.plant_formats.imported import ImportedPlant, placed, site
-from service.sources.plant_formats.text import ForeignLine, read_lines
+from service.sources.plant_formats.mirror_design import FacetedMirror, MirrorDesign, design_of
+from service.sources.plant_formats.soltrace_mirrors import (
+    SOLTRACE_TOLERANCE,
+    Element,
+    Pose,
+    heliostat_groups,
+    like_known,
+    posed_mirror,
+)
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
+from service.sources.text_lines import MAX_BYTES, ForeignLine, split_lines
 
 Array = NDArray[np.float64]
 
-# Largest deviation of an element's x axis from the horizontal [rad].
-_ROLL = 1e-4
+_MAX_TYPES = 64
 
 
 @dataclass(frozen=True)
 class OpticalPair:
     """Reflectivity and errors [mrad] of an element's front."""
 
+    line: ForeignLine = field(compare=False)
     reflectivity: float
     slope: float
     specularity: float
-
-
-@dataclass(frozen=True, eq=False)
-class Element:
-    """A surface of a stage.
-
-    Attributes
-    ----------
-    line : ForeignLine
-    origin : (3,) [m]
-    axes : (3, 3)
-        Unit vectors along its x, y and z, as rows.
-    aperture, surface : str
-        Letters of their kinds.
-    size, shape : sequence of float
-        Parameters of aperture and surface.
-    optics : str
-        Name of its optical pair.
-    """
-
-    line: ForeignLine
-    origin: Array
-    axes: Array
-    aperture: str
-    size: Sequence[float]
-    surface: str
-    shape: Sequence[float]
-    optics: str
+    has_table: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +89,8 @@ def parse_soltrace(path: Path) -> SolTraceInput:
     InvalidInputError
         It names file and line of what is not understood.
     """
-    lines = iter(read_lines(path, "\t"))
+    # SolTrace writes names in the encoding of its machine, and a stage's name may be empty.
+    lines = iter(split_lines(file_name(path), read_text(path, MAX_BYTES, "latin-1"), "\t"))
     try:
         return _parse(lines)
     except (StopIteration, IndexError):
@@ -112,16 +98,20 @@ def parse_soltrace(path: Path) -> SolTraceInput:
 
 
 def _parse(lines: Iterator[ForeignLine]) -> SolTraceInput:
-    head = next(lines)
-    if not head.cells[0].startswith("# SOLTRACE"):
-        raise head.refuse("must begin with # SOLTRACE; it is no input file of SolTrace")
-    sun, position, table = next(lines), next(lines), next(lines)
+    sun = next(lines)
+    if sun.cells[0].startswith("# SOLTRACE"):
+        sun = next(lines)
+    elif sun.cells[0] != "SUN":
+        raise sun.refuse("must begin with # SOLTRACE or SUN; it is no input file of SolTrace")
+    position, table = next(lines), next(lines)
     if sun.cells[:2] != ["SUN", "PTSRC"] or position.cells[0] != "XYZ":
         raise sun.refuse("must be the sun, SUN PTSRC, and its position below")
+    if sun.number(2, 0, 1) != 0:
+        raise sun.refuse("a point source, PTSRC 1, is no sun; write PTSRC 0 and the sun's position")
     if position.cells[4:6] != ["USELDH", "0"]:
         raise position.refuse("a sun by latitude, day and hour is not read; give its position")
     points = [next(lines).numbers(0, 2) for _ in range(int(table.number(1, 0, 1e4)))]
-    shape = sun.cells[4] if len(sun.cells) > 4 else ""
+    shape = sun.cells[4].lower() if len(sun.cells) > 4 else ""
     if shape not in ("p", "g", "d"):
         raise sun.refuse(f"sun shape {shape[:20]!r} is none of p, g, d")
     size = sun.number(6 if shape == "g" else 8, 0, 100)
@@ -147,15 +137,35 @@ def _count(line: ForeignLine, title: str) -> int:
 def _optics(lines: Iterator[ForeignLine]) -> dict[str, OpticalPair]:
     pairs = {}
     for _ in range(_count(next(lines), "OPTICS LIST COUNT")):
-        name, front, _back = next(lines), next(lines), next(lines)
-        if name.cells[0] != "OPTICAL PAIR" or front.cells[0] != "OPTICAL" or len(name.cells) < 2:
+        name = next(lines)
+        if name.cells[0] != "OPTICAL PAIR" or len(name.cells) < 2:
             raise name.refuse("must be an OPTICAL PAIR with its front and back")
-        if front.cells[1] != "g":
-            raise front.refuse("errors that are not Gaussian, g, are not read")
-        pairs[name.cells[1]] = OpticalPair(
-            front.number(5, 0, 1), front.number(7, 0, 1e4), front.number(8, 0, 1e4)
-        )
+        pairs[name.cells[1]] = _surface_optics(lines)
+        _surface_optics(lines)
     return pairs
+
+
+def _surface_optics(lines: Iterator[ForeignLine]) -> OpticalPair:
+    """The optics of a side; tables of the program's OPTICAL.v2 follow it."""
+    side = next(lines)
+    if side.cells[0] not in ("OPTICAL", "OPTICAL.v2"):
+        raise side.refuse("must be OPTICAL or OPTICAL.v2, a side of an OPTICAL PAIR")
+    if side.cells[1] != "g":
+        raise side.refuse("errors that are not Gaussian, g, are not read")
+    tables = [
+        int(side.number(index + 1, 0, 1e6)) * side.number(index, 0, 1)
+        for index in (15, 17)
+        if index + 1 < len(side.cells)
+    ]
+    for _ in range(int(sum(tables))):
+        next(lines)
+    return OpticalPair(
+        side,
+        side.number(5, 0, 1),
+        side.number(7, 0, 1e4),
+        side.number(8, 0, 1e4),
+        bool(tables and tables[0]),
+    )
 
 
 def _stages(lines: Iterator[ForeignLine]) -> list[list[Element]]:
@@ -172,14 +182,12 @@ def _stages(lines: Iterator[ForeignLine]) -> list[list[Element]]:
         next(lines)  # its name
         count = int(head.number(head.cells.index("ELEMENTS") + 1, 0, 1e6))
         elements = [_element(next(lines)) for _ in range(count)]
-        stages.append([element for element in elements if element is not None])
+        if head.cells[11:13] != ["VIRTUAL", "1"]:
+            stages.append(elements)
     return stages
 
 
-def _element(line: ForeignLine) -> Element | None:
-    """The element of a line; None if it is switched off."""
-    if line.number(0, 0, 1) == 0:
-        return None
+def _element(line: ForeignLine) -> Element:
     if len(line.cells) < 29:
         raise line.refuse(f"an element has 29 cells or more, not {len(line.cells)}")
     origin, point = (np.array(line.numbers(first, 3)) for first in (1, 4))
@@ -194,6 +202,8 @@ def _element(line: ForeignLine) -> Element | None:
         line.cells[17],
         line.numbers(18, 8),
         line.cells[27],
+        line.cells[29].strip() if len(line.cells) > 29 else "",
+        line.number(0, 0, 1) == 1,
     )
 
 
@@ -202,7 +212,7 @@ def _element(line: ForeignLine) -> Element | None:
 
 
 def read_soltrace(path: Path) -> ImportedPlant:
-    """Read the plant of an input file: heliostats of one facet, and the receiver.
+    """Read the plant of an input file: heliostats of facets, and receivers.
 
     Aim points are where the file's sun is reflected to.
 
@@ -212,37 +222,68 @@ def read_soltrace(path: Path) -> ImportedPlant:
         It names file and line of what is not understood.
     """
     given = parse_soltrace(path)
-    if len(given.stages) != 2 or not given.stages[0] or len(given.stages[1]) != 1:
+    stages = [[element for element in stage if element.is_enabled] for stage in given.stages]
+    if len(stages) != 2 or not all(stages):
         raise InvalidInputError(
-            f"{file_name(path)}: must have a stage of heliostats and one of a single receiver"
+            f"{file_name(path)}: must have a stage of heliostats and one of receivers"
         )
-    mirrors, (receiver,) = given.stages
-    if len(mirrors) > MAX_HELIOSTATS:
-        raise mirrors[-1].line.refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
-    kinds: dict[tuple[object, ...], str] = {}
+    groups = heliostat_groups(stages[0])
+    if len(groups) > MAX_HELIOSTATS:
+        raise stages[0][-1].line.refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
+    receivers = _receivers(stages[1], given.optics)
+    types: dict[tuple[MirrorDesign, str], str] = {}
     heliostats: list[HeliostatEntry] = []
-    for number, mirror in enumerate(mirrors, start=1):
-        kind = kinds.setdefault(_kind(mirror), f"type-{len(kinds) + 1}")
-        heliostats.append(placed(f"H{number}", kind, mirror.origin.tolist(), _focal_length(mirror)))
-    entry = _receiver(receiver, given.optics)
+    poses: list[Pose] = []
+    known: list[FacetedMirror] = []
+    for name, facets in groups.items():
+        pose, own = posed_mirror(facets)
+        mirror = like_known(own, known)
+        design, focal_length = design_of(mirror, SOLTRACE_TOLERANCE)
+        optics = {facet.optics for facet in facets}
+        if len(optics) > 1:
+            raise facets[0].line.refuse("facets of one heliostat have several optical pairs")
+        kind = types.setdefault((design, optics.pop()), f"type-{len(types) + 1}")
+        if len(types) > _MAX_TYPES:
+            raise facets[0].line.refuse(
+                f"the file has more than {_MAX_TYPES} kinds of heliostats; write each facet's"
+                " heliostat into its comment"
+            )
+        heliostats.append(placed(name, kind, pose.middle.tolist(), focal_length))
+        poses.append(pose)
     azimuth, elevation = (float(angle) for angle in sun_angles(given.sun))
+    n_off = sum(map(len, given.stages)) - sum(map(len, stages))
+    goals = _aims(poses, stages[1], given.sun)
+    entries = {kind: _type(key, kind, given.optics) for key, kind in types.items()}
+    if len(receivers) > 1:
+        heliostats = [
+            entry.model_copy(update={"receiver": _receiver_name(stages[1][goal.receiver])})
+            for entry, goal in zip(heliostats, goals, strict=True)
+        ]
     return ImportedPlant(
         parts={
             "plant": site("soltrace", (0.0, 0.0, 0.0), "UTC"),
-            "heliostat_types": {name: _type(kind, given.optics) for kind, name in kinds.items()},
-            "receivers": {"main": entry},
+            "heliostat_types": entries,
+            "receivers": receivers,
             "sun": _sun(given),
         },
         heliostats=heliostats,
         aims={
-            heliostat.name: aim
-            for heliostat, aim in zip(heliostats, _aims(mirrors, receiver, given.sun), strict=True)
+            heliostat.name: goal.point for heliostat, goal in zip(heliostats, goals, strict=True)
         },
+        facets={_facets_file(kind): key[0].lines for key, kind in types.items()},
         notes=(
             f"The file's sun: azimuth {azimuth:.4f}, elevation {elevation:.4f} degrees. Aim points"
             " are where it is reflected to.",
             "plant: the file has no site; change it to yours.",
+            "heliostats: they turn about azimuth and elevation, and the pivot is the mirror's"
+            " middle; change their mounts to yours.",
             "pointing_error_mrad is SolTrace's specularity error: both spread the beam alike.",
+            *(
+                [f"heliostats: {len(stages[0])} facets are {len(groups)} heliostats."]
+                if len(groups) < len(stages[0])
+                else []
+            ),
+            *([f"{n_off} elements are switched off, and left out."] if n_off else []),
             *(
                 ("sun: a pillbox of the same spread replaces the file's table.",)
                 * (given.sun_shape == "d")
@@ -251,40 +292,19 @@ def read_soltrace(path: Path) -> ImportedPlant:
     )
 
 
-def _kind(mirror: Element) -> tuple[object, ...]:
-    """What mirrors of one type have in common: width, height, surface, optics."""
-    if mirror.aperture != "r":
-        raise mirror.line.refuse(
-            f"aperture {mirror.aperture[:20]!r} of a heliostat is not read; r, a rectangle, is"
-        )
-    if abs(mirror.axes[0, 2]) > _ROLL:
-        raise mirror.line.refuse(
-            "is rolled about its normal; only mirrors on an azimuth-elevation mount are read"
-        )
-    _focal_length(mirror)
-    return (mirror.size[0], mirror.size[1], mirror.surface, mirror.optics)
+def _facets_file(kind: str) -> str:
+    return f"facets-{kind}.csv"
 
 
-def _focal_length(mirror: Element) -> float | None:
-    """The focal length [m] of a paraboloid; None for a flat mirror."""
-    if mirror.surface == "f":
-        return None
-    c_x, c_y = mirror.shape[:2]
-    if mirror.surface != "p" or c_x != c_y or not 1e-5 < c_x < 1:
-        raise mirror.line.refuse(
-            f"surface {mirror.surface[:20]!r} of a heliostat is not read; f, flat, and p, a"
-            " paraboloid of revolution, are"
-        )
-    return 1 / (2 * c_x)
-
-
-def _type(kind: tuple[object, ...], optics: Mapping[str, OpticalPair]) -> dict[str, object]:
-    width, height, surface, name = kind
-    pair = _pair(str(name), optics)
+def _type(
+    key: tuple[MirrorDesign, str], kind: str, optics: Mapping[str, OpticalPair]
+) -> dict[str, object]:
+    design, name = key
+    pair = _pair(name, optics)
     return {
         "mount": {"kind": "azimuth_elevation"},
-        "facets": {"rows": 1, "columns": 1, "width_m": width, "height_m": height},
-        "facet_shape": "flat" if surface == "f" else "slant_range",
+        "facets": {"file": _facets_file(kind)},
+        **design.entries,
         "reflectance": pair.reflectivity,
         "slope_error_mrad": pair.slope,
         "pointing_error_mrad": pair.specularity,
@@ -294,7 +314,37 @@ def _type(kind: tuple[object, ...], optics: Mapping[str, OpticalPair]) -> dict[s
 def _pair(name: str, optics: Mapping[str, OpticalPair]) -> OpticalPair:
     if name not in optics:
         raise InvalidInputError(f"optical pair {name[:60]!r} is not in the file")
+    if optics[name].has_table:
+        raise optics[name].line.refuse(
+            "a table of reflectivity over the angle is not read; give one number, and 0 for it"
+        )
     return optics[name]
+
+
+def _receiver_name(element: Element) -> str:
+    """The name of an element's receiver: our exports name its optics ``receiver NAME``."""
+    prefix, _, name = element.optics.rpartition(" ")
+    return name if prefix == "receiver" and re.fullmatch(NAME, name) else "main"
+
+
+def _receivers(
+    elements: Sequence[Element], optics: Mapping[str, OpticalPair]
+) -> dict[str, dict[str, object]]:
+    """Receivers of elements; several planes of the same optics are panels of one."""
+    found: dict[str, list[dict[str, object]]] = {}
+    for element in elements:
+        found.setdefault(_receiver_name(element), []).append(_receiver(element, optics))
+    entries = {}
+    for name, parts in found.items():
+        if len(parts) > 1 and any(part["kind"] != "plane" for part in parts):
+            raise elements[0].line.refuse(
+                "the stage of receivers has several cylinders of the same optics; give each"
+                " receiver an optical pair of its name"
+            )
+        shared = {"kind": "panels", "absorptance": parts[0]["absorptance"]}
+        panels = [{k: v for k, v in part.items() if k not in shared} for part in parts]
+        entries[name] = parts[0] if len(parts) == 1 else {**shared, "panels": panels}
+    return entries
 
 
 def _receiver(element: Element, optics: Mapping[str, OpticalPair]) -> dict[str, object]:
@@ -344,14 +394,33 @@ def _sun(given: SolTraceInput) -> dict[str, object]:
     return {"shape": "pillbox", "half_angle_mrad": round(float(spread), 4)}
 
 
-def _aims(mirrors: Sequence[Element], receiver: Element, sun: Array) -> Array:
-    """Points (n, 3) [m] of the receiver to which the sun is reflected.
+class _Goal(NamedTuple):
+    """The point (3,) [m] that a mirror aims at, and the index of its element."""
+
+    point: Array
+    receiver: int
+
+
+def _aims(poses: Sequence[Pose], receivers: Sequence[Element], sun: Array) -> list[_Goal]:
+    """Where mirrors reflect the sun to: on the receiver that the ray passes nearest."""
+    origins = np.array([pose.middle for pose in poses])
+    normals = np.array([pose.axes[2] for pose in poses])
+    rays = 2 * (normals @ sun)[:, None] * normals - sun
+    middles = [r.origin + (r.surface != "f") * r.axes[2] / (r.shape[0] or 1) for r in receivers]
+    ways = [middle - origins for middle in middles]
+    missed = [np.linalg.norm(np.cross(way, rays), axis=1) for way in ways]
+    points = [_points_on(receiver, origins, rays) for receiver in receivers]
+    return [
+        _Goal(points[nearest][index], nearest)
+        for index, nearest in enumerate(np.argmin(missed, axis=0).tolist())
+    ]
+
+
+def _points_on(receiver: Element, origins: Array, rays: Array) -> Array:
+    """Points (n, 3) [m] of a receiver that rays meet.
 
     On a cylinder it is the nearer of two, and the nearest to its axis if the light misses it.
     """
-    origins = np.array([mirror.origin for mirror in mirrors])
-    normals = np.array([mirror.axes[2] for mirror in mirrors])
-    rays = 2 * (normals @ sun)[:, None] * normals - sun
     z = receiver.axes[2]
     if receiver.surface == "f":
         ways = ((receiver.origin - origins) @ z) / (rays @ z)

@@ -144,7 +144,8 @@ def _mirror_lines(described: PlantDescription, name: str, pose: _Pose) -> Iterat
         curvature = 0.0 if facet.focal_length is None else 1 / (2 * facet.focal_length)
         surface = _surface("p" if curvature else "f", curvature, curvature)
         shape = f"{_aperture(name, facet)}\t{surface}"
-        yield _element(pose.middle + pose.attitude @ center, axes @ pose.attitude.T, shape, optics)
+        axes_in_field = axes @ pose.attitude.T
+        yield _element(pose.middle + pose.attitude @ center, axes_in_field, shape, optics, name)
 
 
 def _aperture(name: str, facet: Facet) -> str:
@@ -195,7 +196,7 @@ def _surface(kind: str, first: float, second: float) -> str:
     return f"{kind}\t{_joined([first, second, *[0] * 6])}"
 
 
-def _element(origin: Array, axes: Array, shape: str, optics: str) -> str:
+def _element(origin: Array, axes: Array, shape: str, optics: str, comment: str = "") -> str:
     """The line of an element with unit vectors (3, 3) along x, y and z, as rows."""
     x, _, z = axes
     alpha, beta = np.arctan2(z[0], z[2]), np.arcsin(np.clip(z[1], -1, 1))
@@ -203,7 +204,7 @@ def _element(origin: Array, axes: Array, shape: str, optics: str) -> str:
     steep = np.array([-np.sin(alpha) * np.sin(beta), np.cos(beta), -np.cos(alpha) * np.sin(beta)])
     rotation = np.degrees(np.arctan2(-x @ steep, x @ flat))
     pose = _joined([*origin, *(origin + _AIM_DISTANCE * z), rotation])
-    return f"1\t{pose}\t{shape}\t\t{optics}\t2\t"
+    return f"1\t{pose}\t{shape}\t\t{optics}\t2\t{comment}"
 
 
 def _joined(values: Sequence[float] | Array) -> str:

@@ -22,8 +22,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Select, and_, delete, func, not_, or_, select, update
 from sqlalchemy.orm import Session, aliased, defer, undefer
 
-from model.errors import InvalidInputError
-from service.base.errors import ConflictError, NotFoundError, TooManyError
+from service.base.errors import ConflictError, IdempotencyReuseError, NotFoundError, TooManyError
 from service.store.columns import now
 from service.store.job_tables import JobRow, JobStepRow
 from service.store.listing import NEWEST_FIRST, Order, Period, select_after
@@ -66,7 +65,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class QueueBounds:
     """Limits of waiting jobs, in total and per key; None means unlimited."""
 
     queued: int | None = None
@@ -90,7 +89,7 @@ def add_job(
     payload: dict[str, object],
     created_by: str,
     idempotency_key: str | None = None,
-    bounds: Bounds | None = None,
+    bounds: QueueBounds | None = None,
     is_short: bool = False,
 ) -> Added[JobRow]:
     """Queue a job, or find that of the same ``idempotency_key``.
@@ -99,7 +98,7 @@ def add_job(
 
     Raises
     ------
-    InvalidInputError
+    IdempotencyReuseError
         If the same sender used the key for another request.
     TooManyError
         If as many jobs wait already as ``bounds`` allow.
@@ -107,7 +106,7 @@ def add_job(
     row = _find_by_idempotency_key(session, kind, payload, created_by, idempotency_key)
     if row is not None:
         return Added(row, False)
-    _require_capacity(session, created_by, bounds or Bounds())
+    _require_capacity(session, created_by, bounds or QueueBounds())
     at = database_time(session)
     row = JobRow(
         kind=kind,
@@ -126,7 +125,7 @@ def add_job(
     return Added(known, False)
 
 
-def _require_capacity(session: Session, created_by: str, bounds: Bounds) -> None:
+def _require_capacity(session: Session, created_by: str, bounds: QueueBounds) -> None:
     queued = select(func.count()).select_from(JobRow).where(JobRow.state == "queued")
     if bounds.queued is not None and session.scalars(queued).one() >= bounds.queued:
         raise TooManyError(f"{bounds.queued} jobs are waiting; ask again when some are done")
@@ -152,7 +151,7 @@ def _find_by_idempotency_key(
     )
     row = session.scalar(query)
     if row is not None and (row.kind, row.payload) != (kind, payload):
-        raise InvalidInputError(
+        raise IdempotencyReuseError(
             f"Idempotency-Key: it named another request (job {row.id}); choose a new one"
         )
     return row

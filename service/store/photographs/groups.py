@@ -12,12 +12,11 @@ from sqlalchemy import ColumnElement, Select, and_, exists, false, func, not_, s
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from service.base.errors import NotFoundError
-from service.store.listing import Period
+from service.store.listing import EVER, Period
 from service.store.photographs.measurements import EXCLUDED, PREFERENCE
 from service.store.tables import HeliostatRow, MeasurementRow, TargetRow
 
 PhotographVerdict = Literal["used", "refused", "excluded"]
-TimeState = Literal["known", "unknown"]
 
 _Row = MeasurementRow
 _Other = aliased(MeasurementRow)
@@ -50,29 +49,27 @@ class PhotographGroup:
 
 @dataclass(frozen=True)
 class PhotographFilter:
-    """Filter of photographs: heliostat, target, verdict, and time from ``since`` to before
-    ``until``.
+    """Filter of photographs: heliostat, target, verdict, and the period ``taken``.
 
-    ``time`` selects known or unknown times, ``warned`` photographs with or without warnings.
+    ``is_dated`` selects known or unknown times, ``warned`` photographs with or without warnings.
     """
 
     heliostat: HeliostatRow | None = None
     target: TargetRow | None = None
     verdict: PhotographVerdict | None = None
-    since: datetime | None = None
-    until: datetime | None = None
-    time: TimeState | None = None
+    taken: Period = EVER
+    is_dated: bool | None = None
     warned: bool | None = None
 
     @property
     def dated(self) -> bool:
         """Whether the filter includes photographs with a known time."""
-        return self.time != "unknown"
+        return self.is_dated is not False
 
     @property
     def undated(self) -> bool:
         """Whether the filter includes photographs with an unknown time."""
-        return self.time != "known" and self.since is None and self.until is None
+        return self.is_dated is not True and self.taken == EVER
 
 
 def _has_other(condition: ColumnElement[bool] | InstrumentedAttribute[bool]) -> ColumnElement[bool]:
@@ -106,7 +103,7 @@ def dated_groups(
     """Select up to ``limit`` photographs with a known time, newest first, after the mark
     ``before``.
     """
-    taken = Period(filters.since, filters.until).conditions(_Row.taken_at)
+    taken = filters.taken.conditions(_Row.taken_at)
     query = _groups(filters).where(_Row.taken_at.is_not(None), *taken)
     if before is not None:
         query = query.where(tuple_(_Row.taken_at, _Row.id) < before)
@@ -153,7 +150,7 @@ def list_groups(
     last = None if before is None else session.get(_Row, before)
     if before is not None and last is None:
         raise NotFoundError(
-            f"before: there is no photograph of the mark {before}; begin at the first page"
+            f"after: there is no photograph of the mark {before}; begin at the first page"
         )
     found = list[MeasurementRow]()
     if filters.dated and (last is None or last.taken_at is not None):
@@ -177,7 +174,7 @@ def count_groups(
     session: Session, filters: PhotographFilter, before: MeasurementRow | None = None
 ) -> int:
     """The number of photographs, or of those that the list has before ``before``."""
-    taken = Period(filters.since, filters.until).conditions(_Row.taken_at)
+    taken = filters.taken.conditions(_Row.taken_at)
     dated = _groups(filters).where(_Row.taken_at.is_not(None), *taken)
     undated = _groups(filters).where(_Row.taken_at.is_(None))
     if before is not None and before.taken_at is not None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
 from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
@@ -13,7 +12,7 @@ from service.base import names
 from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import JsonObject
 from service.base.plant_facts import PlantFacts
-from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json
+from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json, rectangle
 from service.store.rows import Change, Put, assign, floats, insert, insert_or_find
 from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
 
@@ -57,11 +56,22 @@ def put_plant(session: Session, name: str, origin: ArrayLike) -> Change:
             session.info[_NEW_PLANT] = True  # A session of `Database.writing` is one transaction.
             return Change.NEW
         plant = get_plant(session)
-    if plant.origin != (latitude, longitude, altitude) and _has_positions(session):
-        raise ConflictError(
-            "the plant's origin is fixed: heliostats or targets are stored relative to it"
-        )
+    require_origin(session, name, origin)
     return assign(plant, values)
+
+
+def require_origin(session: Session, name: str, origin: ArrayLike) -> None:
+    """Raise ConflictError if data are stored relative to another origin than that of plant
+    ``name``.
+    """
+    plant = session.get(PlantRow, 1)
+    if plant is not None and plant.origin != tuple(floats(origin)) and _has_positions(session):
+        raise ConflictError(
+            f"the plant's origin is fixed: heliostats or targets of {plant.name} are stored"
+            f" relative to ({', '.join(f'{value:g}' for value in plant.origin)}), and {name} is at"
+            f" ({', '.join(f'{value:g}' for value in floats(origin))}); take another store for"
+            " another plant"
+        )
 
 
 def is_plant_new(session: Session) -> bool:
@@ -208,36 +218,24 @@ def put_target(
         raise ConflictError(
             f"name: {plane.name} is a receiver; choose another name for the target plane"
         )
-    values: dict[str, object] = {
-        "center_m": floats(plane.center),
-        "normal": floats(plane.normal),
-        "up": floats(plane.up),
-        "width_m": float(plane.width),
-        "height_m": float(plane.height),
+    values: JsonObject = {
+        "geometry": rectangle(plane),
+        "corners": corners,
+        "locator": None if plane.locator is None else locator_to_json(plane.locator),
     }
-    locator = None if plane.locator is None else locator_to_json(plane.locator)
-    new = TargetRow(name=plane.name, corners=corners, locator=locator, **values)
-    row, is_new = insert_or_find(session, new)
+    row, is_new = insert_or_find(session, TargetRow(name=plane.name, **values))
     if is_new:
         return Put(row, Change.NEW)
-    moved = any(getattr(row, name) != value for name, value in values.items())
-    # Known corners remain while the plane is unchanged.
-    values["corners"] = corners if moved or corners is not None else row.corners
-    values["locator"] = locator or row.locator
+    if row.geometry == values["geometry"]:
+        values["corners"] = corners or row.corners
+    values["locator"] = values["locator"] or row.locator
     return Put(row, assign(row, values))
 
 
 def target_plane(row: TargetRow) -> TargetPlane:
     """Convert a stored target to the model's target plane."""
-    return TargetPlane(
-        name=row.name,
-        center=np.array(row.center_m),
-        normal=np.array(row.normal),
-        up=np.array(row.up),
-        width=row.width_m,
-        height=row.height_m,
-        locator=None if row.locator is None else locator_from_json(row.locator),
-    )
+    locator = None if row.locator is None else locator_from_json(row.locator)
+    return TargetPlane(row.name, **row.geometry, locator=locator)
 
 
 def list_receivers(session: Session) -> Sequence[ReceiverRow]:
@@ -290,39 +288,14 @@ def put_receiver(session: Session, receiver: Receiver) -> Put[ReceiverRow]:
         raise ConflictError(
             f"name: {receiver.name} is a target plane; choose another name for the receiver"
         )
-    values: dict[str, object] = {
-        "kind": document["kind"],
-        "center_m": floats(receiver.center),
-        "normal": floats(receiver.normal),
-        "up": floats(receiver.up),
-        "height_m": float(receiver.height),
-        "width_m": document.get("width"),
-        "radius_m": document.get("radius"),
-        "opening_deg": document.get("opening_deg"),
-        "panels": document.get("panels"),
-        "aperture_m": document.get("aperture"),
-        "absorptance": document["absorptance"],
-    }
+    values: JsonObject = {"kind": document.pop("kind"), "geometry": document}
     row, is_new = insert_or_find(session, ReceiverRow(name=receiver.name, **values))
     return Put(row, Change.NEW if is_new else assign(row, values))
 
 
-_FIELDS = {
-    "plane": ("center", "normal", "up", "width", "height"),
-    "cylinder": ("center", "normal", "up", "radius", "height", "opening_deg"),
-    "panels": ("panels",),
-    "cavity": ("aperture", "panels"),
-}
-"""Fields of a receiver's document by its kind."""
-
-_COLUMNS = {name: f"{name}_m" for name in ("center", "width", "radius", "height", "aperture")}
-"""Columns by field, where the names differ."""
-
-
 def receiver_document(row: ReceiverRow) -> JsonObject:
     """A stored receiver as REST and exports have it, without its name."""
-    known = {name: getattr(row, _COLUMNS.get(name, name)) for name in _FIELDS[row.kind]}
-    return {"kind": row.kind, **known, "absorptance": row.absorptance}
+    return {"kind": row.kind, **row.geometry}
 
 
 def stored_receiver(row: ReceiverRow) -> AnyReceiver:

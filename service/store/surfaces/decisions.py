@@ -236,6 +236,24 @@ def list_decisions(
     return session.scalars(select_after(session, query, DecisionRow, NEWEST_FIRST, after)).all()
 
 
+def find_comparison(
+    session: Session, surface: SurfaceRow, other: SurfaceRow | None
+) -> Justification | None:
+    """The last comparison of a version with another one, or with the ideal mirror for None."""
+    query = select(DecisionRow).where(
+        DecisionRow.heliostat_id == surface.heliostat_id, DecisionRow.photographs > 0
+    )
+    second = None if other is None else other.version
+    for row in session.scalars(query.order_by(DecisionRow.id.desc())):
+        reason, before, after = row.reason, row.accuracy_before, row.accuracy_after
+        if (row.previous, row.surface.version) == (surface.version, second):
+            reason, before, after = f"version {second} {reason}", after, before
+        elif (row.previous, row.surface.version) != (second, surface.version):
+            continue
+        return Justification(reason, before, after, row.photographs)
+    return None
+
+
 def find_undoable(session: Session, heliostat: HeliostatRow) -> DecisionRow | None:
     """The last decision that changed the active surface; None if nothing can be undone.
 

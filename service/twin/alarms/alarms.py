@@ -8,11 +8,11 @@ or when its measured value doubles.
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from datetime import time as clock
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby, pairwise
 from operator import itemgetter
 from typing import Annotated, NamedTuple
@@ -22,9 +22,11 @@ from pydantic import ConfigDict, Field, computed_field
 from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session
 
+from model.changes import LevelChange, find_changes
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
 from model.times import format_minute, format_time
+from service import store
 from service.base.fields import From
 from service.base.settings import Settings
 from service.store import acknowledgements, field_state
@@ -44,14 +46,18 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin.alarms import offers
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
 from service.twin.alarms.light import LostLight, find_lost_light
+from service.twin.alarms.measured_states import measure_states
+from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, ReasonOf, SeverityOf
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
+from service.twin.forecasts.mirror_states import MirrorStates
 from service.twin.plant import model_versions
 from service.twin.pointing.errors import DriveStep, PointingState
 from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
-from service.twin.studies.field_change import ContradictedEffect
+from service.twin.studies.field_change import AdoptableStudy, EffectFindings
 
 AlarmId = Annotated[
     str,
@@ -91,6 +97,15 @@ class Alarm:
         int | None,
         Field(
             description="Number of the acknowledgement, which may be undone; null: there is none."
+        ),
+    ] = None
+    offer: Annotated[
+        Offer | None,
+        Field(
+            description=(
+                "What to do, where one request does it; null: see the causes of the alarms, or of"
+                " the heliostat."
+            )
         ),
     ] = None
 
@@ -149,11 +164,16 @@ _COLUMNS = {
 _OF_ALARM = [_COLUMNS[one.name] for one in fields(Alarm)]
 
 
-def read_alarms(session: Session) -> AlarmList:
-    """Read all alarms, sorted by urgency of the reason, then by time with the newest first."""
+def read_alarms(session: Session, heliostat: str | None = None) -> AlarmList:
+    """Read all alarms, or those of a heliostat and of the plant.
+
+    They are sorted by urgency of the reason, then by time with the newest first.
+    """
     state = field_state.read_field_state(session)
     query = acknowledgements.open_with_acknowledgements(*_OF_ALARM)
     query = query.outerjoin(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
+    if heliostat is not None:
+        query = query.where(or_(HeliostatRow.name == heliostat, HeliostatRow.id.is_(None)))
     alarms = [Alarm(*row) for row in session.execute(query)]
     order = {reason: place for place, reason in enumerate(REASONS)}
     alarms.sort(
@@ -168,7 +188,7 @@ def compute_alarms(
     lines: Sequence[HeliostatOverview],
     settings: Settings,
     cameras: CameraReadings,
-    contradicted: Sequence[ContradictedEffect],
+    effects: EffectFindings,
 ) -> list[Alarm]:
     """Compute the alarms of the plant, its cameras, its model and its heliostats.
 
@@ -178,11 +198,12 @@ def compute_alarms(
     lost = find_lost_light(cameras.light, settings.alarm_light_loss)
     found = [
         *_queue(session, settings),
-        *_outdated_aims(session, settings),
+        *_outdated_aims(session, settings, partial(measure_states, lines, cameras.light)),
         *_camera(session),
         *_watch_cameras(session, cameras.changes, zone),
         *_clock(session),
-        *_ended_effects(contradicted),
+        *_ended_effects(session, effects),
+        *_undecided(effects.adoptable),
     ]
     found += _accuracies(session, settings)
     found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
@@ -255,6 +276,7 @@ def _pointing(
             f"its spot is {pointing.error_mrad:.1f} mrad off{metres}",
             "photograph it where the calibration plan says, and calibrate its mount again",
             _fingerprint(pointing.beyond_since, pointing.error_mrad / settings.alarm_pointing_mrad),
+            offer=offers.calibrate([line.name]),
         )
     if pointing.drifted is not None:
         drifted = pointing.drifted
@@ -270,6 +292,7 @@ def _pointing(
 
 
 def _moved_drives(name: str, moved: DriveStep) -> Alarm:
+    offer = None if moved.is_calibrated else offers.calibrate([name])
     if moved.is_calibrated:
         size = f"its drives stepped by {moved.size_mrad:.1f} mrad"
         action = "find out why; its mount is calibrated since"
@@ -277,7 +300,8 @@ def _moved_drives(name: str, moved: DriveStep) -> Alarm:
         size = f"its spot is {moved.size_mrad:.1f} mrad off since"
         action = "look at its drives and encoders, and calibrate its mount again"
     fingerprint = f"{moved.since.isoformat()} {moved.until.isoformat()}"
-    return Alarm("moved", name, moved.until, f"it moved {moved.when}: {size}", action, fingerprint)
+    message = f"it moved {moved.when}: {size}"
+    return Alarm("moved", name, moved.until, message, action, fingerprint, offer=offer)
 
 
 def _without_photograph(session: Session, allowed: timedelta, at: datetime) -> Iterator[Alarm]:
@@ -319,7 +343,7 @@ _GIVE_TIMES = (
 
 def _times_unknown(name: str, count: int, first: datetime) -> Alarm:
     which = "its one accepted photograph" if count == 1 else f"all {count} accepted photographs"
-    message = f"the time of {which} is unknown, and so is the age"
+    message = f"the time of {which} is unknown, and so is the age; the first arrived then"
     action = f"{_GIVE_TIMES}, and have taken_at sent with each photograph"
     return Alarm("times_unknown", name, first, message, action, first.isoformat())
 
@@ -344,16 +368,38 @@ def _warned(session: Session) -> Iterator[Alarm]:
     row, photograph = HeliostatRow, MeasurementRow
     count = func.count(func.distinct(_photograph()))
     began = func.min(func.coalesce(photograph.taken_at, photograph.created_at))
-    query = select(row.name, count, began).group_by(row.id, row.name)
+    query = select(row.name, count, began, row.id).group_by(row.id, row.name)
     query = query.join(photograph, photograph.heliostat_id == row.id)
     query = query.where(
         photograph.warnings.is_not(None), func.coalesce(photograph.reason, "") != EXCLUDED
     )
     for reason, (type_, said, remedy) in _WARNED.items():
-        for name, warned, first in session.execute(query.where(has_warning(type_))):
+        for name, warned, first, number in session.execute(query.where(has_warning(type_))):
             message = f"{warned} measurement{'s' if warned > 1 else ''} {said}"
+            change = _begin_of_warnings(session, number, type_)
+            if change is not None:
+                message += f", most since a time after {format_minute(change.since)}"
             action = f"see /photographs?heliostat={name}&warned=true, and {remedy}"
-            yield Alarm(reason, name, first, message, action, _fingerprint(first, warned))
+            since = first if change is None else change.until
+            yield Alarm(reason, name, since, message, action, _fingerprint(first, warned))
+
+
+def _begin_of_warnings(session: Session, heliostat: int, type_: str) -> LevelChange | None:
+    """The last change from photographs without a warning to photographs with it."""
+    row = MeasurementRow
+    query = select(row.taken_at, has_warning(type_)).order_by(row.taken_at.desc(), row.id.desc())
+    query = query.where(row.heliostat_id == heliostat, row.accepted, row.taken_at.is_not(None))
+    found = session.execute(query.limit(_WARNINGS_READ)).all()[::-1]
+    times = [at for at, _ in found if at is not None]
+    changes = find_changes(times, [float(bool(one)) for _, one in found], _NOT_WARNED)
+    return next((one for one in reversed(changes) if one.max_drop < 0), None)
+
+
+_WARNINGS_READ = 24
+"""Newest photographs of a heliostat that date its warnings."""
+
+_NOT_WARNED = 0.25
+"""Noise of the share of photographs with a warning: some have none by chance."""
 
 
 def _photograph() -> ColumnElement[str]:
@@ -477,9 +523,11 @@ def _queue(session: Session, settings: Settings) -> Iterator[Alarm]:
 _NAMED = 10
 
 
-def _outdated_aims(session: Session, settings: Settings) -> Iterator[Alarm]:
+def _outdated_aims(
+    session: Session, settings: Settings, measure: Callable[[], MirrorStates]
+) -> Iterator[Alarm]:
     """Find plans of aims for the current day whose heliostats or model changed since."""
-    for plan in outdated_plans(session, settings.time_zone):
+    for plan in outdated_plans(session, settings.time_zone, measure):
         names = plan.heliostats
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         parts = [f"{part} of {len(of)}" for part, of in plan.changes.items()]
@@ -522,7 +570,7 @@ def _camera(session: Session) -> Iterator[Alarm]:
                     f"{name} {day}",
                 )
     declared = _declared_anew(session)
-    if declared is not None:
+    if declared is not None and declared.reason is None:  # else a job measures them again
         yield Alarm(
             "camera",
             None,
@@ -538,6 +586,7 @@ def _camera(session: Session) -> Iterator[Alarm]:
 def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alarm]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
+    study = store.newest_study(session) if cameras else None
     for change in cameras:
         since = datetime.combine(change.day, clock(), ZoneInfo(zone)).astimezone(UTC)
         if declared is None or since > declared.adopted_at:
@@ -553,6 +602,7 @@ def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str)
                 "look at the camera's exposure, focus and lens; study the photographs, or declare"
                 " the camera again",
                 f"{change.target} {change.figure} {way} {change.day:%Y-%m}",
+                offer=None if offers.has_seen(study, since) else offers.study(None, since),
             )
 
 
@@ -576,10 +626,16 @@ def _clock(session: Session) -> Iterator[Alarm]:
         )
 
 
-def _ended_effects(contradicted: Sequence[ContradictedEffect]) -> Iterator[Alarm]:
+def _ended_effects(session: Session, effects: EffectFindings) -> Iterator[Alarm]:
     """Report adopted effects that later photographs contradict."""
-    for one in contradicted:
+    for one in effects.contradicted:
         action = f"end it by {one.until}" if one.can_end else "withdraw it"
+        same = [other for other in effects.contradicted if other.study == one.study]
+        offer = None
+        if all(other.can_end for other in same):
+            offer = offers.adopt(one.study, {other.effect: other.until for other in same})
+        elif model_versions.is_current(session, one.study):
+            offer = offers.withdraw(one.study)
         yield Alarm(
             "effect_ended",
             None,
@@ -587,6 +643,24 @@ def _ended_effects(contradicted: Sequence[ContradictedEffect]) -> Iterator[Alarm
             one.in_words,
             f"{action}, see /studies/{one.study}/change",
             f"{one.study} {one.effect}",
+            offer=offer,
+        )
+
+
+def _undecided(adoptable: AdoptableStudy | None) -> Iterator[Alarm]:
+    """Report a study whose effects make forecasts better, and that is not adopted."""
+    if adoptable is not None:
+        study, ends, change = adoptable
+        gain = change.whole
+        yield Alarm(
+            "study_undecided",
+            None,
+            study.created_at,
+            f"study {study.id} says: {study.conclusion.rstrip('.')}; with its effects the accuracy"
+            f" changes by {100 * gain.mean:+.1f} points on {gain.photographs} photographs",
+            f"adopt it, see /studies/{study.id}/change",
+            str(study.id),
+            offer=offers.adopt(study.id, ends),
         )
 
 
@@ -598,6 +672,6 @@ def _declared_anew(session: Session) -> ModelRow | None:
     plant = session.get(PlantRow, 1)
     rows = [row for row in model_versions.list_models(session) if row.withdrawn_at is None]
     declared = [None if plant is None else plant.declared, *(row.declared for row in rows)]
-    cameras = [(document or {}).get("cameras") for document in declared]
+    cameras = [(document or {}).get("cameras") or [] for document in declared]
     changed = [row for row, (old, new) in zip(rows, pairwise(cameras), strict=True) if old != new]
     return changed[-1] if changed else None

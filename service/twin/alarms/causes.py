@@ -1,8 +1,10 @@
 """Rank likely causes of a heliostat's poor forecasts, each with its evidence and the next step."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date, datetime
+from functools import cached_property
 from statistics import median
 from typing import Annotated, Literal, NamedTuple
 from zoneinfo import ZoneInfo
@@ -16,8 +18,6 @@ from model.frames import sun_direction
 from model.times import format_minute
 from service import store
 from service.base.settings import Settings
-from service.store import acknowledgements
-from service.store.job_tables import AcknowledgementRow, AlarmRow
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -26,13 +26,16 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin.alarms import offers
+from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import HeliostatOverview
+from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import Reason
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.outliers import list_outliers
 from service.twin.plant import model_versions
 from service.twin.surfaces.accuracy import (
-    Comparison,
+    PhotographComparison,
     photograph_name,
     photographs_of_surface,
     rank_of,
@@ -134,7 +137,8 @@ class HeliostatFacts:
     """What the store knows of a heliostat, as `rank_causes` needs it.
 
     ``study`` is the newest study's sentence about what the model lacks. ``usual_misfit`` [1] is the
-    median of the field's active surfaces. ``alarms`` are the messages of its open alarms.
+    median of the field's active surfaces. ``alarms`` are its open alarms, and ``adopting`` is the
+    offer to adopt ``study``, which is of ``newest_study`` like that sentence.
     """
 
     limit: float
@@ -148,26 +152,35 @@ class HeliostatFacts:
     study: StudyFinding | None = None
     fall: AccuracyFall | None = None
     epoch: Epoch | None = None
-    alarms: Mapping[Reason, str] = field(default_factory=dict)
+    alarms: Mapping[Reason, Alarm] = field(default_factory=dict)
+    adopting: Offer | None = None
+    newest_study: StudyRow | None = None
 
-    def since_fall(self) -> list[PhotographFacts]:
-        """Photographs since the accuracy fell, unless that of other heliostats fell then, too."""
-        if self.fall is None:
-            return []
-        since = self.fall.until
-        found = [one for one in self.photographs if one.taken_at and one.taken_at >= since]
+    @cached_property
+    def usual_accuracy(self) -> float:
+        """The median accuracy [1] of its photographs; zero if none is known."""
+        known = [one.accuracy for one in self.photographs if one.accuracy is not None]
+        return median(known) if known else 0.0
+
+    def since_change(self) -> list[PhotographFacts]:
+        """Photographs since its accuracy fell, or since it moved until it was calibrated.
+
+        None if the accuracy of other heliostats fell then, too. A spot that moved may be truncated.
+        """
+        pointing, changes = self.line.pointing, list[tuple[datetime, datetime | None]]()
+        if pointing is not None and pointing.moved is not None:
+            moved = pointing.moved
+            changes.append((moved.until, pointing.calibrated_at if moved.is_calibrated else None))
+        if self.fall is not None:
+            changes.append((self.fall.until, None))
+        found = [
+            one
+            for one in self.photographs
+            for begin, end in changes
+            if one.taken_at and begin <= one.taken_at and (end is None or one.taken_at < end)
+        ]
         days = [one.taken_at.date() for one in found if one.taken_at]
         return [] if fell_with_others(days, self.others) else found
-
-
-@dataclass(frozen=True)
-class Offer:
-    """A request that does what a cause asks for."""
-
-    label: Annotated[str, Field(description="What it does.")]
-    method: Annotated[Literal["POST", "PATCH"], Field(description="Method of the request.")]
-    path: Annotated[str, Field(description="Its path.")]
-    body: Annotated[dict[str, object], Field(description="Its body as JSON.")]
 
 
 @dataclass(frozen=True)
@@ -217,8 +230,7 @@ def count_photographs(count: int) -> str:
 
 def outlier_reasons(facts: HeliostatFacts) -> dict[str, str]:
     """Why each outlier is one, by identifier, the worst first; other photographs are left out."""
-    known = [one.accuracy for one in facts.photographs if one.accuracy is not None]
-    usual = median(known) if known else 0.0
+    usual = facts.usual_accuracy
     in_time = sorted(
         (one for one in facts.photographs if one.accuracy is not None),
         key=lambda one: (one.taken_at is not None, one.taken_at),
@@ -265,10 +277,10 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
     if undated and not any(one.kind in ("clock", "haze") for one in found):
         said = f"the times of {undated} of {count_photographs(len(facts.photographs))} are unknown"
         found.append(LikelyCause("times_unknown", 0.0, said))
-    for reason, said in facts.alarms.items():
+    for reason, alarm in facts.alarms.items():
         kinds = _OF_ALARM.get(reason, ())
         if kinds and not any(one.kind in kinds for one in found):
-            found.append(LikelyCause(kinds[0], _OF_OPEN_ALARM, said))
+            found.append(LikelyCause(kinds[0], _OF_OPEN_ALARM, alarm.message))
     order = list(CAUSES)
     found.sort(key=lambda one: (-one.explained_share, order.index(one.kind)))
     return [replace(one, offer=_offer(facts, one)) for one in found]
@@ -276,28 +288,51 @@ def rank_causes(facts: HeliostatFacts) -> list[LikelyCause]:
 
 def _offer(facts: HeliostatFacts, cause: LikelyCause) -> Offer | None:
     """What a person would do about a cause, where a request does it."""
-    name = facts.line.name
-    of_name: dict[str, object] = {"heliostats": [name]}
-    refined = of_name | {"method": "refined"}
+    name, dimmed = facts.line.name, facts.alarms.get("dimmed")
     match cause.kind:
         case "no_surface" if facts.line.candidate is None:
-            return Offer("Predict its surface", "POST", "/v1/jobs/predictions", refined)
+            return offers.predict("Predict its surface", name)
+        case "clock":
+            return _correct_times(facts)
         case "mirror" if cause.since is not None:
-            since = {"since": cause.since.isoformat()}
-            label = "Predict again from photographs since then"
-            return Offer(label, "POST", "/v1/jobs/predictions", refined | since)
+            return offers.predict("Predict again from photographs since then", name, cause.since)
         case "foreign_light" if cause.measurements:
-            path = f"/v1/heliostats/{name}/measurements/{cause.measurements[0]}"
-            body: dict[str, object] = {"excluded": True, "reason": cause.evidence[:200]}
-            return Offer(f"Exclude photograph {cause.measurements[0]}", "PATCH", path, body)
+            (one,) = (p for p in facts.photographs if p.identifier == cause.measurements[0])
+            return offers.exclude(name, one.identifier, cause.evidence, one.was_used)
         case "moved":
-            return Offer("Calibrate its mount again", "POST", "/v1/jobs/calibrations", of_name)
+            alarms = (facts.alarms.get("moved"), facts.alarms.get("pointing"))
+            return next((one.offer for one in alarms if one is not None and one.offer), None)
+        case "soiled" if dimmed is not None:
+            said = "its mirror is to be cleaned; forecasts take its light as photographs show it"
+            return offers.acknowledge("Acknowledge, and have it cleaned", [dimmed.id], said)
         case "model" if cause.study is not None:
-            path = f"/v1/studies/{cause.study}/adopt"
-            return Offer(f"Adopt study {cause.study}", "POST", path, {})
-        case "model":
-            return Offer("Study its photographs", "POST", "/v1/jobs/studies", of_name)
+            return facts.adopting
+        case "model" | "haze":
+            taken = [at for one in facts.photographs if (at := one.taken_at) is not None]
+            of_day = (at for at in taken if cause.day in (None, at.date()))
+            last = max(of_day, default=None)
+            of_field = cause.kind == "haze"
+            if last is None or offers.has_seen(
+                facts.newest_study, last, None if of_field else name
+            ):
+                return None
+            changed = facts.fall.until if of_field and facts.fall is not None else last
+            return offers.study(None, changed) if of_field else offers.study([name], None)
     return None
+
+
+def _correct_times(facts: HeliostatFacts) -> Offer | None:
+    """The correction of the clock that explains most photographs."""
+    name, taken = facts.line.name, defaultdict[float, list[tuple[str, str, datetime]]](list)
+    for one in facts.photographs:
+        warning = one.warning(SUN_CONTRADICTS_TIME) or {}
+        ahead = warning.get("clock_ahead_h")
+        if one.taken_at is not None and isinstance(ahead, (int, float)):
+            taken[ahead].append((name, one.identifier, one.taken_at))
+    if not taken:
+        return None
+    hours = max(taken, key=lambda one: len(taken[one]))
+    return offers.correct_times(taken[hours], hours)
 
 
 def _no_surface(facts: HeliostatFacts) -> list[LikelyCause]:
@@ -365,7 +400,7 @@ def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[Likel
             f" {len(facts.photographs)} much better"
         )
         return _of_photographs("foreign_light", unlike, poor, said)
-    days, changed = set(_hazy_days(facts, poor)), facts.since_fall()
+    days, changed = set(_hazy_days(facts, poor)), facts.since_change()
     apart = [
         one
         for one in facts.photographs
@@ -387,13 +422,18 @@ def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[Likel
 
 
 def _hazy_days(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[date]:
-    """Days with poor photographs, on which those of other heliostats were poor too; worst first."""
+    """Days whose poor photographs are so with those of other heliostats; the worst day first.
+
+    Others were much worse than usual, or by a third of what this heliostat was: thin haze lowers
+    small spots more than large ones.
+    """
     counts: dict[date, int] = {}
     for one in facts.photographs:
         if one.identifier in poor and one.taken_at is not None:
             day = one.taken_at.date()
             other = facts.others.get(day)
-            if other is not None and other.is_worse:
+            own = facts.usual_accuracy - (one.accuracy or 0.0)
+            if other is not None and (other.is_worse or 0 < own <= 3 * other.drop):
                 counts[day] = counts.get(day, 0) + 1
     return sorted(counts, key=lambda day: (-counts[day], day))
 
@@ -494,7 +534,7 @@ def read_facts(
     line: HeliostatOverview,
     row: HeliostatRow,
     surface: SurfaceRow | None,
-    comparisons: Sequence[Comparison],
+    comparisons: Sequence[PhotographComparison],
     settings: Settings,
 ) -> HeliostatFacts | None:
     """Read what `rank_causes` needs of a heliostat and of the surface that forecasts it.
@@ -522,12 +562,16 @@ def read_facts(
     accuracies = [rank_of(comparisons).accuracy, None if drift is None else drift.accuracy]
     is_below = any(one is not None and one < settings.alarm_accuracy for one in accuracies)
     has_warnings = any(one.warnings for one in photographs)
-    alarms = _open_alarms(session, row.name)
+    opened = [one for one in read_alarms(session, row.name).alarms if not one.acknowledged_by]
+    alarms = {one.reason: one for one in opened if one.heliostat is not None}
     is_ideal = line.surface is None and bool(photographs)
     is_bad = is_below or fall or is_candidate or has_warnings or is_ideal or alarms
-    if not (is_bad or _has_alarm(line)):
+    if not is_bad:
         return None
     days = {one.taken_at.date() for one in photographs if one.taken_at is not None}
+    newest = store.newest_study(session)
+    study = None if newest is None else _study(session, row.name, newest)
+    adopting = next((one.offer for one in opened if one.reason == "study_undecided"), None)
     return HeliostatFacts(
         settings.alarm_accuracy,
         photographs,
@@ -537,28 +581,12 @@ def read_facts(
         None if surface is None else surface.sun_span_deg,
         None if surface is None else surface.misfit,
         _usual_misfit(session),
-        _study(session, row.name),
+        study,
         fall,
         epoch,
         alarms,
-    )
-
-
-def _open_alarms(session: Session, heliostat: str) -> dict[Reason, str]:
-    """Messages of a heliostat's open alarms that nobody acknowledged, by reason."""
-    query = acknowledgements.open_with_acknowledgements(AlarmRow.reason, AlarmRow.message)
-    query = query.join(HeliostatRow, HeliostatRow.id == AlarmRow.heliostat_id)
-    query = query.where(HeliostatRow.name == heliostat, AcknowledgementRow.id.is_(None))
-    return {row.reason: row.message for row in session.execute(query)}
-
-
-def _has_alarm(line: HeliostatOverview) -> bool:
-    """Whether its surface has warnings that nobody acknowledged, or its pointing is off."""
-    surface, pointing = line.surface or line.candidate, line.pointing
-    return bool(
-        (surface is not None and surface.warnings and surface.acknowledged_by is None)
-        or (pointing is not None and pointing.beyond_since is not None)
-        or (pointing is not None and pointing.moved and not pointing.moved.is_calibrated)
+        adopting if study is not None else None,
+        newest,
     )
 
 
@@ -571,11 +599,9 @@ def _usual_misfit(session: Session) -> float | None:
     return median(one or 0.0 for one in found) if len(found) > 2 else None
 
 
-def _study(session: Session, heliostat: str) -> StudyFinding | None:
-    """What the newest study found that the model lacks, if it included the heliostat."""
-    query = select(StudyRow).order_by(StudyRow.id.desc()).limit(1)
-    study = session.scalars(query).one_or_none()
-    if study is None or study.verdict == "none" or heliostat not in study.heliostats:
+def _study(session: Session, heliostat: str, study: StudyRow) -> StudyFinding | None:
+    """What a study found that the model lacks, if it included the heliostat."""
+    if study.verdict == "none" or heliostat not in study.heliostats:
         return None
     if model_versions.find_adopted(session, study.id) is not None:
         return None

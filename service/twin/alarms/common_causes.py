@@ -4,31 +4,37 @@ Alarms of one reason that began within a day, and more often than usual, are a b
 knows of that time is evidence of its cause. Bursts with the same evidence have one cause.
 """
 
-from bisect import bisect_right
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from itertools import groupby
 from statistics import median
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, computed_field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.times import format_minute
+from service import store
 from service.base.settings import Settings
+from service.store.acknowledgements import Key
 from service.store.job_tables import JobRow
+from service.store.photographs.measurements import EXCLUDED
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     HeliostatRow,
+    HeliostatStateRow,
     MeasurementRow,
     ModelRow,
     TargetRow,
 )
+from service.twin.alarms import offers
 from service.twin.alarms.acknowledging import AlarmsTogether
 from service.twin.alarms.alarms import Alarm, AlarmId
+from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import REASONS, Reason
 
 MIN_ALARMS = 5
@@ -55,6 +61,13 @@ _BY_JOB: dict[Reason, str] = {
     "sun_contradicts_time": "imports",
     "times_unknown": "imports",
 }
+_AS_BY: dict[Reason, str] = {
+    "accuracy": "haze or a camera",
+    "fell": "haze or a camera",
+    "moved": "a target that moved, or a clock",
+    "pointing": "a target that moved, or a clock",
+}
+"""What affects nearly all heliostats, by the reason of their alarms."""
 _ON_ARRIVAL: tuple[Reason, ...] = ("unlike_heliostat", "sun_contradicts_time", "times_unknown")
 """Reasons that begin when a photograph arrives."""
 _WHEN_TAKEN: tuple[Reason, ...] = ("accuracy", "fell", "moved", "pointing")
@@ -69,6 +82,9 @@ class CommonCause(AlarmsTogether):
         tuple[str, ...],
         Field(description="What the store knows of that time; empty if it knows nothing."),
     ]
+    offer: Annotated[
+        Offer | None, Field(description="What to do about all of them; null: see each heliostat.")
+    ] = None
 
     @computed_field
     @property
@@ -97,22 +113,53 @@ def find_common_causes(
     clocks = _same_clocks(session, opened, settings)
     explained = {alarm.key for one in clocks for alarm in one.members}
     opened = [alarm for alarm in opened if alarm.key not in explained]
+    begins = _begins(session, opened)
     found = clocks + [
         CommonCause(burst, tuple(_evidence(session, burst, opened, settings)))
         for reason in REASONS
-        for burst in find_bursts([a for a in opened if a.reason == reason and a.heliostat])
+        for burst in find_bursts([a for a in opened if a.reason == reason and a.heliostat], begins)
     ]
     merged = []
     for evidence, causes in groupby(
         sorted(found, key=lambda one: one.evidence), key=lambda one: one.evidence
     ):
         same = list(causes)
-        merged += (
-            [CommonCause([alarm for one in same for alarm in one.members], evidence)]
-            if evidence
-            else same
-        )
+        if evidence:
+            members = [alarm for one in same for alarm in one.members]
+            same = [CommonCause(members, evidence, next((o for c in same if (o := c.offer)), None))]
+        merged += [one if one.offer else replace(one, offer=_offer(session, one)) for one in same]
     return sorted(merged, key=lambda one: -len(one.members))
+
+
+def _begins(session: Session, alarms: Sequence[Alarm]) -> dict[Key, datetime]:
+    """When changes behind alarms began at the earliest: after the last photograph before each."""
+    state = HeliostatStateRow
+    query = select(HeliostatRow.name, state.fall, state.pointing)
+    query = query.join(state, state.heliostat_id == HeliostatRow.id)
+    names = {one.heliostat for one in alarms if one.reason in ("fell", "moved") and one.heliostat}
+    found = dict[tuple[str, str], object]()
+    for name, fall, pointing in session.execute(query.where(HeliostatRow.name.in_(names))):
+        for reason, change in (("fell", fall), ("moved", (pointing or {}).get("moved"))):
+            if isinstance(change, dict):
+                found[name, reason] = change["since"]
+    return {
+        one.key: datetime.fromisoformat(str(begin))
+        for one in alarms
+        if (begin := found.get((one.heliostat or "", one.reason)))
+    }
+
+
+def _offer(session: Session, cause: CommonCause) -> Offer | None:
+    """One request for all alarms of a cause; a study if none does what is to be done."""
+    reasons = set(cause.alarms)
+    if reasons <= {"moved", "pointing"}:
+        names = {one.heliostat for one in cause.members if one.heliostat and one.offer}
+        return offers.calibrate(sorted(names)) if names else None
+    if reasons & {"accuracy", "fell"} and not offers.has_seen(
+        store.newest_study(session), cause.last_at
+    ):
+        return offers.study(cause.heliostats, cause.first_at)
+    return None
 
 
 def _same_clocks(
@@ -121,18 +168,28 @@ def _same_clocks(
     """Contradictions of sun and time that one wrong clock explains, of whatever days."""
     of = {a.heliostat: a for a in alarms if a.reason == SUN_CONTRADICTS_TIME and a.heliostat}
     row = MeasurementRow
-    query = select(HeliostatRow.name, row.warnings).join(row, row.heliostat_id == HeliostatRow.id)
-    query = query.where(row.warnings.is_not(None), HeliostatRow.name.in_(list(of)[:_MOST_NAMES]))
-    clocks: dict[str, dict[str, Alarm]] = {}
-    for name, warnings in session.execute(query):
-        for detail in _clock_details(warnings):
-            clocks.setdefault(detail, {})[name] = of[name]
+    photograph = func.coalesce(row.external_id, row.identifier)
+    query = select(HeliostatRow.name, photograph, row.identifier, row.taken_at, row.warnings)
+    query = query.join(row, row.heliostat_id == HeliostatRow.id)
+    is_used = func.coalesce(row.reason, "") != EXCLUDED
+    names = HeliostatRow.name.in_(list(of)[:_MOST_NAMES])
+    clocks = defaultdict[float, dict[tuple[str, str], tuple[str, str, datetime]]](dict)
+    details = dict[float, str]()
+    for name, key, number, at, warnings in session.execute(
+        query.where(row.warnings.is_not(None), is_used, names).order_by(row.id)
+    ):
+        for one in warnings or ():
+            if at is not None and (ahead := one.get("clock_ahead_h")):
+                clocks[ahead][name, key] = (name, number, at)
+                details[ahead] = next(iter(_clock_details([one])))
     found = []
-    for detail, by_name in clocks.items():
-        if len(by_name) >= _MIN_SAME_CLOCK:
-            same = tuple(by_name.values())
+    for ahead, taken in clocks.items():
+        same = tuple({name: of[name] for name, _ in taken}.values())
+        if len(same) >= _MIN_SAME_CLOCK:
+            detail = details[ahead]
             others = (one for one in _evidence(session, same, alarms, settings) if one != detail)
-            found.append(CommonCause(same, (detail, *others)))
+            offer = offers.correct_times(list(taken.values()), ahead)
+            found.append(CommonCause(same, (detail, *others), offer))
     return found
 
 
@@ -142,15 +199,24 @@ def _clock_details(warnings: Sequence[Mapping[str, str]] | None) -> list[str]:
     return [said for one in found if (said := one["detail"].partition("; ")[2])]
 
 
-def find_bursts(alarms: Sequence[Alarm]) -> list[tuple[Alarm, ...]]:
-    """Find the alarms of one reason that began within a day, repeatedly the most at once."""
-    bursts = []
+def find_bursts(
+    alarms: Sequence[Alarm], begins: Mapping[Key, datetime] | None = None
+) -> list[tuple[Alarm, ...]]:
+    """Find the alarms of one reason that one event explains, repeatedly the most at once.
+
+    An alarm's change was between ``begins``, by default its ``since``, and a day after that.
+    """
+    bursts, begins = [], begins or {}
     rest = sorted(alarms, key=lambda alarm: alarm.since)
     while len(rest) >= MIN_ALARMS:
-        moments = [alarm.since for alarm in rest]
-        ends = [bisect_right(moments, moment + _WINDOW) for moment in moments]
-        start = max(range(len(rest)), key=lambda place: ends[place] - place)
-        burst, others = rest[start : ends[start]], rest[:start] + rest[ends[start] :]
+        first = np.array([begins.get(one.key, one.since).timestamp() for one in rest])
+        last = np.array([(one.since + _WINDOW).timestamp() for one in rest])
+        moments = np.sort(first)  # most intervals overlap where one of them begins
+        begun = np.searchsorted(moments, moments, "right")
+        moment = moments[np.argmax(begun - np.searchsorted(np.sort(last), moments))]
+        is_of = (first <= moment) & (moment <= last)
+        burst = [one for one, is_in in zip(rest, is_of, strict=True) if is_in]
+        others = [one for one, is_in in zip(rest, is_of, strict=True) if not is_in]
         span = rest[-1].since - rest[0].since
         usual = len(others) / max(span / _WINDOW, _LEAST_DAYS)
         if len(burst) < max(MIN_ALARMS, _LEAST_RATIO * usual):
@@ -177,8 +243,8 @@ def _evidence(
         yield from _models(session, before, cause.last_at)
     if reason in _BY_JOB:
         yield from _jobs(session, _BY_JOB[reason], cause)
-    if reason in ("accuracy", "fell"):
-        yield from _photographed(session, cause)
+    if reason in _AS_BY:
+        yield from _photographed(session, cause, _AS_BY[reason])
     if reason in (*_ON_ARRIVAL, *_WHEN_TAKEN):
         yield from _photographs(session, reason, cause)
     if reason == "no_photograph":
@@ -202,7 +268,7 @@ def _jobs(session: Session, kind: str, cause: CommonCause) -> Iterator[str]:
         yield f"job {number} ({kind}) ran at that time"
 
 
-def _photographed(session: Session, cause: CommonCause) -> Iterator[str]:
+def _photographed(session: Session, cause: CommonCause, said: str) -> Iterator[str]:
     """Whether nearly all heliostats that were photographed at that time are affected."""
     row = MeasurementRow
     query = select(func.count(row.heliostat_id.distinct())).where(
@@ -212,7 +278,7 @@ def _photographed(session: Session, cause: CommonCause) -> Iterator[str]:
     if affected >= _NEARLY_ALL * count:
         yield (
             f"{affected} of {max(count, affected)} heliostats that were photographed at that time"
-            " are affected, as by haze or a camera"
+            f" are affected, as by {said}"
         )
 
 

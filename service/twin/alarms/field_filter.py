@@ -81,7 +81,7 @@ METRICS: dict[str, Metric] = {
         ),
         Metric(
             "misfit",
-            "Surface misfit",
+            "Unexplained flux",
             "%",
             1,
             "What the surface leaves unexplained of the photographs that it was made from.",

@@ -108,12 +108,19 @@ class FieldStateWriter:
             lambda session: _write(session, reading, self._runtime.settings)
         )
         self.is_large, took_s = len(reading.lines) > LARGE, time.monotonic() - begun_s
-        self._compute(reading.pending, max(_BATCH_S, 3 * took_s), stopping or threading.Event())
-        self._marks, self._written_s = "" if reading.pending else reading.marks, time.monotonic()
-        return len(reading.pending)
+        pending = [] if self._is_measuring() else reading.pending
+        self._compute(pending, max(_BATCH_S, 3 * took_s), stopping or threading.Event())
+        self._marks, self._written_s = "" if pending else reading.marks, time.monotonic()
+        return len(pending)
+
+    def _is_measuring(self) -> bool:
+        """Whether photographs are measured again: a series by two cameras would seem to fall."""
+        running = select(JobRow.id).where(JobRow.kind == "measurements", JobRow.state == "running")
+        with self._runtime.database.reading() as session:
+            return session.scalar(running.limit(1)) is not None
 
     def _read(self) -> _Reading:
-        settings, contradicted = self._runtime.settings, self._effects.read()
+        settings, effects = self._runtime.settings, self._effects.read()
         with self._runtime.database.reading() as session:
             revision, at, marks = (
                 field_state.read_field_state(session).revision,
@@ -121,7 +128,7 @@ class FieldStateWriter:
                 read_marks(session),
             )
             lines, cameras = read_summaries(session), self._watch.read(session, settings)
-            alarms = compute_alarms(session, lines, settings, cameras, contradicted)
+            alarms = compute_alarms(session, lines, settings, cameras, effects)
         return _Reading(revision, at, marks, lines, cameras.changes, alarms)
 
     def _compute(

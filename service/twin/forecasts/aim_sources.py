@@ -1,9 +1,9 @@
 """What a plan of aims was computed from, and what of it changed since."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 from zoneinfo import ZoneInfo
 
 from sqlalchemy import func, select
@@ -14,6 +14,7 @@ from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import HeliostatRow, MountRow, PlantRow
+from service.twin.forecasts.mirror_states import MirrorStates
 from service.twin.plant import model_versions
 
 KIND = "aim-plans"
@@ -31,11 +32,13 @@ def plant_time_zone(session: Session, default: str | None) -> str:
 class Sources(TypedDict):
     """Model version, and by heliostat the versions of surface and mount, and its properties' time.
 
-    Versions are None for heliostats without a surface, or never calibrated.
+    Versions are None for heliostats without a surface, or never calibrated. ``states`` are measured
+    cleanliness [1] and pointing error [mrad], None if not measured.
     """
 
     model: int
     heliostats: dict[str, list[int | str | None]]
+    states: NotRequired[dict[str, list[float | None]]]
 
 
 def sources_of(session: Session, names: Sequence[str], model: int | None = None) -> Sources:
@@ -75,11 +78,29 @@ class OutdatedPlan:
         return sorted({name for names in self.changes.values() for name in names})
 
 
+def has_other_state(
+    states: MirrorStates, name: str, clean: float | None, mrad: float | None
+) -> bool:
+    """Whether a mirror surely has another cleanliness than assumed, or points surely worse."""
+    dimmed, error = states.cleanliness.get(name), states.pointing_mrad.get(name)
+    if dimmed is None or dimmed.ci95 is None or clean is None:
+        is_other = (dimmed is None) != (clean is None)
+    else:
+        is_other = not dimmed.ci95[0] <= clean <= dimmed.ci95[1]
+    is_worse = bool(error and error.ci95 and mrad is not None and mrad < error.ci95[0])
+    return is_worse or is_other
+
+
 _PARTS = ("surface", "mount", "properties")
 
 
-def outdated_plans(session: Session, default_zone: str | None) -> list[OutdatedPlan]:
-    """The newest plan of the current day for each target, if something changed since."""
+def outdated_plans(
+    session: Session, default_zone: str | None, measure: Callable[[], MirrorStates]
+) -> list[OutdatedPlan]:
+    """The newest plan of the current day for each target, if something changed since.
+
+    ``measure`` measures the present states of mirrors.
+    """
     today = now().astimezone(ZoneInfo(plant_time_zone(session, default_zone))).date().isoformat()
     query = (
         select(JobRow.id, JobRow.payload["target"].as_string(), JobRow.finished_at)
@@ -88,12 +109,16 @@ def outdated_plans(session: Session, default_zone: str | None) -> list[OutdatedP
         .order_by(JobRow.id)
     )
     newest = {target: (job, target, at) for job, target, at in session.execute(query)}
-    found = (_outdated(session, *one) for one in newest.values())
+    found = (_outdated(session, measure, *one) for one in newest.values())
     return [one for one in found if one is not None]
 
 
 def _outdated(
-    session: Session, job: int, target: str | None, made_at: datetime
+    session: Session,
+    measure: Callable[[], MirrorStates],
+    job: int,
+    target: str | None,
+    made_at: datetime,
 ) -> OutdatedPlan | None:
     before = queue.load_checkpoint(session, job, SOURCES)
     if before is None:
@@ -105,6 +130,11 @@ def _outdated(
         for part, was, is_now in zip(_PARTS, old, new or [None] * len(_PARTS), strict=True):
             if was != is_now:
                 changes[part].append(name)
+    if assumed := before.get("states"):
+        states = measure()
+        changes["measured state"] = [
+            name for name, values in assumed.items() if has_other_state(states, name, *values)
+        ]
     changes = {part: sorted(names) for part, names in changes.items() if names}
     models = before["model"], current["model"]
     is_other = models[0] != models[1]

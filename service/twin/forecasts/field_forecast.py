@@ -1,14 +1,15 @@
 """Flux forecasts of many heliostats, tile by tile, for one sun and one receiver."""
 
 import math
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.aiming.kernels import ImageTracer, Kernels, MirrorImages
+from model.aiming.kernels import ImageTile, ImageTracer, Kernels, MirrorImages
 from model.errors import ModelError
 from model.fleet import (
     TILE,
@@ -20,19 +21,21 @@ from model.fleet import (
     tile_of,
     tile_size,
 )
+from model.frames import sun_direction
 from model.neighbours import Neighbours
 from model.plant import Heliostat, Receiver, Tower
-from model.progress import nothing_between
 from model.setup import Setup
-from model.surface import control_points
+from model.surface import DEGREE, control_points
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
+from service.base.fields import Sun
 from service.base.memory import return_memory
 from service.base.progress import Report
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.forecasts.mirror_states import MirrorState, MirrorStates, count_sources, in_state
+from service.twin.forecasts.watts import Sunlight, dni_of
 from service.twin.heliostats.stored_mount import as_calibrated
 from service.twin.plant.model_versions import ModelVersion
 from service.twin.runtime.engines import Threads, engine_of
@@ -44,28 +47,58 @@ Array = NDArray[np.float64]
 _NEIGHBOURS_SHARE = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class HeliostatGroup:
-    """Stored heliostats that light one receiver.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fleet:
+    """Heliostats that light one receiver, of the store or of a plant's file, for any sun.
 
     Attributes
     ----------
     names : sequence of str
     receiver : Receiver
-    sun : (3,)
-        Unit vector towards the recorded sun.
     model : ModelVersion
+    sunlight : float [W/m2] or "clear_sky"
     aim : (3,) [m] or None
         Aim point of all heliostats that are not in ``aims``; None for the receiver's default.
     aims : mapping of heliostat names to (3,) [m]
-    around : mapping of heliostat names to receivers or (3,) [m]
-        Heliostats that send no light, and where they aim: they block and shade.
-    ideal : bool
-        Trace ideal surfaces instead of the active ones.
     tower : Tower or None
         It shades mirrors.
     states : MirrorStates or None
         Measured states in which mirrors are traced; None for mirrors as declared.
+    around : mapping of heliostat names to receivers or (3,) [m]
+        Heliostats that send no light, and where they aim: they block and shade.
+    """
+
+    names: Sequence[str]
+    receiver: Receiver
+    model: ModelVersion
+    sunlight: Sunlight
+    aim: Sequence[float] | None
+    aims: Mapping[str, Sequence[float] | Array]
+    tower: Tower | None
+    states: MirrorStates | None
+    around: Mapping[str, Receiver | Array]
+
+    def under(self, sun: Sun, ideal: bool) -> "HeliostatGroup":
+        """The heliostats under this sun, with their current surfaces or ``ideal`` ones."""
+        dni = dni_of(self.sunlight, sun.elevation_deg, self.model.site.altitude_m)
+        known = vars(self) | {
+            "model": self.model.with_dni(dni),
+            "states": None if ideal else self.states,
+        }
+        direction = sun_direction(sun.azimuth_deg, sun.elevation_deg)
+        return HeliostatGroup(**known, sun=direction, ideal=ideal)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeliostatGroup(Fleet):
+    """A fleet under one sun.
+
+    Attributes
+    ----------
+    sun : (3,)
+        Unit vector towards the recorded sun.
+    ideal : bool
+        Trace ideal surfaces instead of the active ones.
     skipped : dict
         Heliostats that could not be read, with the reason. The forecast fills it.
     without_surface : set of str
@@ -74,16 +107,8 @@ class HeliostatGroup:
         States in which mirrors are traced, by heliostat. The forecast fills it.
     """
 
-    names: Sequence[str]
-    receiver: Receiver
     sun: Array
-    model: ModelVersion
-    aim: Array | None
-    aims: Mapping[str, Sequence[float]]
     ideal: bool
-    tower: Tower | None = None
-    states: MirrorStates | None = None
-    around: Mapping[str, Receiver | Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     without_surface: set[str] = field(default_factory=set)
     traced_states: dict[str, MirrorState] = field(default_factory=dict)
@@ -97,6 +122,26 @@ class HeliostatGroup:
         if isinstance(aim, Sequence | np.ndarray):
             return np.asarray(aim, dtype=np.float64)
         return aim.aim_of(heliostat.position)
+
+    def in_state(self, heliostat: Heliostat) -> Heliostat:
+        """A heliostat in its state, which ``traced_states`` receives."""
+        if self.states is None or heliostat.name in self.around:
+            return heliostat
+        state = self.traced_states[heliostat.name] = self.states.of(heliostat)
+        return in_state(heliostat, state)
+
+    def setup(self, heliostat: Heliostat, points: Array, degree: int = DEGREE) -> Setup:
+        """A heliostat, with its mirror's control points (F, I, J, 3) [m], under the sun."""
+        aim, name = self.aim_of(heliostat), heliostat.name
+        plane = self.receiver.middle
+        return Setup(heliostat, points, self.sun, plane, aim=aim, degree=degree, identifier=name)
+
+    def task(
+        self, resolution: tuple[int, int], has_neighbours: bool = True, **options: Any
+    ) -> Superposition:
+        """What is traced of each tile; ``options`` are those of `Superposition`."""
+        tower = self.tower.outline(self.sun) if self.tower and has_neighbours else None
+        return Superposition(self.receiver, self.model, resolution, tower=tower, **options)
 
     def sources(self, skipped: Container[str] = ()) -> dict[str, dict[str, int]]:
         """How many values of traced mirrors are measured, declared and defaults."""
@@ -155,8 +200,9 @@ def forecast_group(
         traced(number)
 
     engine: Engine = engine_of(runtime)
+    between = _between(engine, lambda: traced(number))
     total = runtime.operations.superpose(
-        _task(fleet, resolution, neighbours, engine, lambda: traced(number)),
+        fleet.task(resolution, neighbours, **between),
         _tiles(runtime, fleet, field, size, number),
         engine,
         before=None if begun is None else begun.light,
@@ -165,18 +211,10 @@ def forecast_group(
     return replace(total, skipped=fleet.skipped | total.skipped)
 
 
-def _task(
-    fleet: HeliostatGroup,
-    resolution: tuple[int, int],
-    neighbours: bool,
-    engine: Engine,
-    check: Callable[[], None],
-) -> Superposition:
-    """What is traced of each tile; ``check`` is called between its parts."""
+def _between(engine: Engine, check: Callable[[], None]) -> dict[str, Callable[[], None]]:
+    """The option of `Superposition` that calls ``check`` between the parts of a tile."""
     # Work on other machines cannot check whether it shall stop.
-    between = check if isinstance(engine, Threads) else nothing_between
-    tower = None if fleet.tower is None or not neighbours else fleet.tower.outline(fleet.sun)
-    return Superposition(fleet.receiver, fleet.model, resolution, tower=tower, between=between)
+    return {"between": check} if isinstance(engine, Threads) else {}
 
 
 def trace_kernels(
@@ -199,22 +237,42 @@ def trace_kernels(
     count = math.ceil(len(fleet.names) / TILE)
     traced = _Counted(report, "images of mirrors", count, _NEIGHBOURS_SHARE, 0.5)
     engine, n_done = engine_of(runtime), 0
-    task = _task(fleet, resolution, neighbours, engine, lambda: traced(n_done))
+    task = fleet.task(resolution, neighbours, **_between(engine, lambda: traced(n_done)))
 
-    def tiles() -> Iterator[MirrorImages]:
+    def tile_done(_images: int) -> None:
         nonlocal n_done
-        for tile in engine.map(ImageTracer(task), _tiles(runtime, fleet, field, TILE, 0)):
-            fleet.skipped.update(tile.skipped)
-            n_done += 1
-            traced(n_done)
-            yield from tile.images
+        n_done += 1
+        traced(n_done)
 
-    images = MirrorImages.join(tiles(), len(fleet.names))
-    if images is None:
+    tiles = _tiles(runtime, fleet, field, TILE, 0)
+    kernels = join_images(task, engine.map(ImageTracer(task), tiles), fleet, tile_done)
+    if kernels is None:
         name, reason = next(iter(fleet.skipped.items()), ("the store", "it holds no heliostat"))
         raise ConflictError(f"no heliostat reaches {fleet.receiver.name}; {name}: {reason}")
+    return kernels
+
+
+def join_images(
+    task: Superposition,
+    tiles: Iterable[ImageTile],
+    fleet: HeliostatGroup,
+    done: Callable[[int], None],
+) -> Kernels | None:
+    """Join the images of a group's ``tiles`` on the map; None if no heliostat has one.
+
+    ``done`` receives the number of images of each tile. ``fleet.skipped`` receives heliostats
+    without one.
+    """
+
+    def traced() -> Iterator[MirrorImages]:
+        for tile in tiles:
+            fleet.skipped.update(tile.skipped)
+            done(len(tile.images))
+            yield from tile.images
+
+    images = MirrorImages.join(traced(), len(fleet.names))
     return_memory()
-    return images.on_map(fleet.receiver, resolution)
+    return None if images is None else images.on_map(task.receiver, task.resolution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,11 +340,9 @@ def _heliostats(fleet: HeliostatGroup, batch: _Batch) -> Iterator[Heliostat]:
             fleet.skipped[name] = f"there is no heliostat {name}; POST it to /v1/heliostats first"
             continue
         try:
-            heliostat = as_calibrated(batch.rows[name], batch.mounts.get(name), fleet.model)
-            if fleet.states is not None and name not in fleet.around:
-                state = fleet.traced_states[name] = fleet.states.of(heliostat)
-                heliostat = in_state(heliostat, state)
-            yield heliostat
+            yield fleet.in_state(
+                as_calibrated(batch.rows[name], batch.mounts.get(name), fleet.model)
+            )
         except ModelError as error:
             fleet.skipped[name] = str(error)
 
@@ -354,12 +410,4 @@ def _setups(fleet: HeliostatGroup, batch: _Batch, heights: Mapping[str, Array]) 
         name = heliostat.name
         if not fleet.ideal and name not in heights:
             fleet.without_surface.add(name)
-        points = control_points(heliostat, heights.get(name))
-        yield Setup(
-            heliostat,
-            points,
-            fleet.sun,
-            fleet.receiver.middle,
-            aim=fleet.aim_of(heliostat),
-            identifier=name,
-        )
+        yield fleet.setup(heliostat, control_points(heliostat, heights.get(name)))

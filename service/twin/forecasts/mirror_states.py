@@ -84,6 +84,19 @@ class MirrorStates:
             pointing_error_mrad=_measured(self.pointing_mrad.get(name), pointing),
         )
 
+    def in_words(self, name: str) -> list[str]:
+        """What was measured of a heliostat, as a sentence; none if nothing was."""
+        clean, mrad = self.values_of(name)
+        parts = [] if clean is None else [f"its cleanliness {clean:.2f}"]
+        parts += [] if mrad is None else [f"its pointing error {mrad:.2f} mrad"]
+        verb = "counts" if len(parts) == 1 else "count"
+        return [f"as photographs measured, {' and '.join(parts)} {verb}"] if parts else []
+
+    def values_of(self, name: str) -> list[float | None]:
+        """Measured cleanliness [1] and pointing error [mrad] of a heliostat; None if not."""
+        found = self.cleanliness.get(name), self.pointing_mrad.get(name)
+        return [None if one is None else one.value for one in found]
+
 
 AS_DECLARED = MirrorStates()
 """Nothing is measured."""

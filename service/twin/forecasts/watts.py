@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag
+from typing_extensions import TypedDict
 
 from model.fleet import LOSSES, FleetFlux, Losses, field_losses
 from service.base.fields import Irradiance
@@ -50,35 +51,51 @@ def dni_of(
     return sunlight
 
 
-class LightWatts(TypedDict):
-    """Light of mirrors [W, m2]; the others are factors in the order of the light."""
+class ForecastLosses(TypedDict):
+    """What becomes of the light on a heliostat, in watts.
 
-    mirror_area_m2: float
-    incident_w: float
-    cosine: float
-    shading: float
-    blocking: float
-    reflectance: float
-    cleanliness: float
-    attenuation: float
-    intercept: float
-    absorptance: float
-    optical_efficiency: float
-    intercepted_w: float
-    absorbed_w: float
+    The factors are in the order of the light, and each is the share that is left. Neighbours and
+    tower are not traced, so that shading and blocking are 1.
+    """
+
+    mirror_area_m2: Annotated[float, Field(description="Area of the facets [m2].")]
+    incident_w: Annotated[float, Field(description="Direct normal irradiance times that area [W].")]
+    cosine: Annotated[
+        float,
+        Field(
+            description=(
+                "Projection of the mirror towards the sun, less what the effects soiling and"
+                " blocking take [1]."
+            )
+        ),
+    ]
+    shading: Annotated[float, Field(description="Share that is not shaded [1].")]
+    blocking: Annotated[float, Field(description="Share that is not blocked [1].")]
+    reflectance: Annotated[
+        float, Field(description="Reflectance of mirrors and of the model's optics [1].")
+    ]
+    cleanliness: Annotated[float, Field(description="Share that soiling leaves; here 1 [1].")]
+    attenuation: Annotated[float, Field(description="Share that the air leaves [1].")]
+    intercept: Annotated[
+        float, Field(description="Share that hits the whole target or receiver, mapped or not [1].")
+    ]
+    absorptance: Annotated[float, Field(description="Share that it absorbs [1].")]
+    optical_efficiency: Annotated[float, Field(description="Product of the factors [1].")]
+    intercepted_w: Annotated[float, Field(description="Power on the whole target or receiver [W].")]
+    absorbed_w: Annotated[float, Field(description="Power that it absorbs [W].")]
 
 
-class FieldWatts(LightWatts):
+class FieldWatts(ForecastLosses):
     """The light of a field, and its peak [W/m2]."""
 
     heliostats: int
     peak_w_m2: float
 
 
-def light_watts(losses: Losses, dni_w_m2: float) -> LightWatts:
+def light_watts(losses: Losses, dni_w_m2: float) -> ForecastLosses:
     """The light of mirrors with these losses, of one heliostat or of many."""
     incident = dni_w_m2 * losses.area
-    return LightWatts(
+    return ForecastLosses(
         mirror_area_m2=losses.area,
         incident_w=incident,
         cosine=losses.cosine,

@@ -24,7 +24,9 @@ from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
+from service.sources.juelich import CENTERED_SIZE_ERROR
 from service.store.pointing import mounts
+from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.stored_mount import as_calibrated
 from service.twin.plant import model_versions
@@ -65,6 +67,10 @@ class AcceptedMeasurement:
         Where the image of the target is saturated.
     sheet_share : float [1]
         See `model.imaging.Quality`.
+    square : (64, 64) or None
+        All of a ``flux-centered`` image, over `CENTERED_WINDOW`; None of other kinds.
+    temperature_c : float or None [deg C]
+        Of the air.
     """
 
     identifier: str
@@ -77,6 +83,8 @@ class AcceptedMeasurement:
     taken_at: datetime | None = None
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
+    square: NDArray[np.float32] | None = None
+    temperature_c: float | None = None
 
     def observation(self, side: float = FLUX_WINDOW) -> Observation:
         """What a square of ``side`` [m] about the spot shows of the mirror.
@@ -93,6 +101,7 @@ class AcceptedMeasurement:
             clipped=self._clipped_about_spot(side),
             taken_at=self.taken_at,
             side=side,
+            size_error=0.0 if self.square is None else CENTERED_SIZE_ERROR,
         )
 
     def _about_spot(self, side: float) -> NDArray[np.float32]:
@@ -144,6 +153,7 @@ class AcceptedMeasurement:
             degree=degree,
             identifier=key,
             taken_at=self.taken_at,
+            temperature_c=self.temperature_c,
         )
         return FluxImage(
             shot,
@@ -237,12 +247,14 @@ def load_heliostat_context(
     )
 
 
-def heights_of(surface: SurfaceRow | None) -> Array | None:
-    """Control heights (4, 8, 8) [m] of a stored surface; None for the ideal one.
+def heights_of(surface: SurfaceRow | NewSurface | None) -> Array | None:
+    """Control heights (4, 8, 8) [m] of a surface; None for the ideal one.
 
-    The surface must be loaded with its arrays.
+    A stored surface must be loaded with its arrays.
     """
-    return None if surface is None else unpack(surface.arrays)["z"].astype(np.float64)
+    if surface is None or isinstance(surface, NewSurface):
+        return None if surface is None else surface.z
+    return unpack(surface.arrays)["z"].astype(np.float64)
 
 
 def accepted_measurement(
@@ -265,6 +277,8 @@ def accepted_measurement(
         taken_at=row.taken_at,
         clipped=None if clipped is None else np.asarray(clipped, dtype=bool),
         sheet_share=float(row.quality.get("sheet_share") or 0),
+        square=arrays.get("square"),
+        temperature_c=row.temperature_c,
     )
 
 

@@ -49,7 +49,7 @@ _METADATA = (
 )
 _WEATHER = tuple(weather.name for weather in fields(Weather))
 _MEASURED = ("accepted", "reason", "center_right_m", "center_up_m", "arrays")
-_PLANE = ("name", "center_m", "normal", "up", "width_m", "height_m", "locator")
+_PLANE = ("name", "geometry", "locator")
 
 
 class NothingToChangeError(ConflictError):

@@ -11,7 +11,7 @@ from service.twin.heliostats.measurements import load_heliostat_context
 from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.photographs.ingest import MeasuredImage, measure_stored
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import Comparison, compare_with
+from service.twin.surfaces.accuracy import PhotographComparison, compare_with
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def load_for_display(runtime: Runtime, heliostat: str, row: MeasurementRow) -> M
     )
 
 
-def compare_one(runtime: Runtime, heliostat: str, identifier: str) -> Comparison:
+def compare_one(runtime: Runtime, heliostat: str, identifier: str) -> PhotographComparison:
     """Compare a photograph with the forecast of the active surface and the current model.
 
     Raises

@@ -289,7 +289,7 @@ def measurement_row(
     contradiction: SunContradiction | None,
 ) -> MeasurementRow:
     """Create the row of a measurement, without heliostat, image and identifier."""
-    arrays = {"flux": measured.flux, "centered": measured.centered}
+    arrays = {"flux": measured.flux, "centered": measured.centered, "square": measured.square}
     images: dict[str, NDArray[Any]] = {
         n: np.asarray(array, np.float32) for n, array in arrays.items() if array is not None
     }

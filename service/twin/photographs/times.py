@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
-from service.base.fields import Moment
+from service.base.fields import Moment, read_time
 from service.base.validation_messages import format_validation_error
 from service.store.photographs.groups import PhotographFilter, list_groups
 from service.twin.photographs.batches import MOST_ENTRIES
@@ -93,7 +93,7 @@ def _read(
 def _with_zone(text: str, zone: str | None) -> object:
     """A time without a zone as one of ``zone``; other text as it is."""
     try:
-        at = datetime.fromisoformat(text.strip())
+        at = read_time(text)
     except ValueError:
         return text
     return at.replace(tzinfo=ZoneInfo(zone)) if zone and at.tzinfo is None else text
@@ -109,7 +109,7 @@ def shifted_times(
     InvalidInputError
         If it has no photograph of a known time, or too many.
     """
-    groups = list_groups(session, replace(chosen, time="known"), MOST_ENTRIES + 1)
+    groups = list_groups(session, replace(chosen, is_dated=True), MOST_ENTRIES + 1)
     if not 0 < len(groups) <= MOST_ENTRIES:
         raise InvalidInputError(
             f"selection: {f'more than {MOST_ENTRIES}' if groups else 'no'} photographs of a known"

@@ -8,11 +8,12 @@ requested, even withdrawn ones.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from model.camera_choice import DECLARATIONS
 from model.effects import (
     Always,
     ByDay,
@@ -39,6 +40,7 @@ from service.store.plant.model_versions import (
     version_name,
 )
 from service.store.tables import ModelRow, StudyRow
+from service.twin.plant.adoption_rules import names_of, why_refused
 from service.twin.plant.open_questions import open_questions
 
 __all__ = [
@@ -58,6 +60,9 @@ __all__ = [
     "withdraw",
 ]
 
+
+CameraAnswer = Literal["srgb", "linear"]
+"""Images without background are differences of sRGB counts, or linear light."""
 
 Declaration = dict[str, object] | None
 """A declared model, as stored; None is the default one."""
@@ -168,9 +173,8 @@ def effect_key(effect: Effect) -> str:
 
 
 def is_open(effect: Effect) -> bool:
-    """Whether an effect acts on all photographs to come, with the same values."""
-    scope = effect.scope
-    return isinstance(scope, Always) or (isinstance(scope, Since) and scope.until is None)
+    """Whether an effect acts on all photographs to come."""
+    return isinstance(effect.scope, Always) or effect.scope.until is None
 
 
 def first_day(effect: Effect, study: StudyRow) -> date:
@@ -202,8 +206,10 @@ def effects_of_study(study: StudyRow, ends: Ends | None = None) -> tuple[Effect,
 
 
 def _ended(effect: Effect, since: date, until: date) -> Effect:
-    named = None if isinstance(effect.scope, ByDay) else effect.scope.heliostats
-    return replace(effect, scope=Since(since, named, until))
+    scope = effect.scope
+    if isinstance(scope, ByDay):
+        return replace(effect, scope=replace(scope, until=until))
+    return replace(effect, scope=Since(since, scope.heliostats, until))
 
 
 def without(model: ModelVersion, effects: Iterable[Effect]) -> ModelVersion:
@@ -314,23 +320,17 @@ def adopt(
     NotFoundError
         If there is no such study.
     ConflictError
-        If the study found no effect, or another version than ``shown`` is current. Without
-        ``force``, also if its verdict is not "effect", or if it was made with another version than
-        the current one. Without a ``reason``, if the study leaves questions open
+        If its result cannot be adopted (`why_refused`), or if another version than ``shown`` is
+        current. Without ``force``, also if it was made with another
+        version than the current one. Without a ``reason``, if the study leaves questions open
         (`open_questions`).
     InvalidInputError
         If ``ends`` are not of its effects.
     """
     study = store.get_study(session, number)
-    found = _effects(study.report)
-    current = current_number(session)
-    if not found:
-        raise ConflictError(f"study {number} found no effect; there is nothing to adopt")
-    if study.verdict != "effect" and not force:
-        raise ConflictError(
-            f"study {number}: its verdict is '{study.verdict}'; force it to adopt what it found"
-            " anyway"
-        )
+    findings, current = store.study_findings(session, [number])[number], current_number(session)
+    if refusal := why_refused(findings):
+        raise ConflictError(f"study {number}: {refusal}")
     if shown not in (None, current):
         newest = find_current(session)
         by = "" if newest is None else f", adopted by {newest.adopted_by}"
@@ -348,7 +348,7 @@ def adopt(
         )
     if held is not None and held.number == current and not is_ending:
         return held
-    questions = open_questions(study.report["effects"], study.report["unexplained_share"])
+    questions = open_questions(findings)
     if questions and not reason and not is_ending:
         raise ConflictError(
             f"reason: study {number} leaves questions open"
@@ -359,7 +359,7 @@ def adopt(
     declared = declared_of(session, next_.base)
     row = add_model(session, next_.effects, declared, study.id, actor)
     row.reason = reason
-    names = [effect.name for effect in found]
+    names = names_of(findings)
     until = {key: day.isoformat() for key, day in (ends or {}).items()}
     about: dict[str, object] = {"model": row.version, "effects": names, **_given(reason)}
     about |= {"until": until} if until else {}
@@ -369,6 +369,27 @@ def adopt(
 
 def _given(reason: str | None) -> dict[str, str]:
     return {"reason": reason} if reason else {}
+
+
+def declares_camera(session: Session) -> bool:
+    """Whether the current version declares cameras, or that there are none."""
+    return "cameras" in (declared_of(session, find_current(session)) or {})
+
+
+def declare_camera(session: Session, answer: CameraAnswer, actor: str, reason: str) -> None:
+    """Declare the camera of images without background, in a new version with the same effects.
+
+    Nothing changes if the current version declares cameras.
+    """
+    current = find_current(session)
+    if declares_camera(session):
+        return
+    declared = (declared_of(session, current) or {}) | DECLARATIONS[answer]
+    effects = () if current is None else _effects(current.effects)
+    row = add_model(session, effects, declared, None, actor)
+    row.reason = reason
+    about = {"model": row.version, "answer": answer, "reason": reason}
+    audit.record(session, actor, "camera.declared", "the plant's model", **about)
 
 
 def withdraw(session: Session, study: int, actor: str, reason: str | None = None) -> ModelRow:

@@ -17,6 +17,7 @@ from model.plant import Plant, Receiver, TargetPlane
 from service import store
 from service.base.fields import JsonObject
 from service.base.plant_facts import NO_FACTS, PlantFacts
+from service.base.receivers import NAMES_WITH_UNITS
 from service.sources.documents import read_heliostat
 from service.sources.heliostat_of_type import HeliostatOfType, document_of
 from service.sources.paint_documents import Corners
@@ -206,8 +207,12 @@ def _changed_values(row: Base) -> dict[str, JsonObject]:
         for old, new in zip(history.deleted or (), history.added or (), strict=True):
             if isinstance(old, dict) and isinstance(new, dict):
                 parts = [part for part in old.keys() | new.keys() if old.get(part) != new.get(part)]
-                before |= {f"{column.key}.{part}": old.get(part) for part in parts}
-                after |= {f"{column.key}.{part}": new.get(part) for part in parts}
+                before |= {_label(column.key, part): old.get(part) for part in parts}
+                after |= {_label(column.key, part): new.get(part) for part in parts}
             else:
                 before[column.key], after[column.key] = old, new
     return {"before": before, "after": after} if after else {}
+
+
+def _label(column: str, part: str) -> str:
+    return NAMES_WITH_UNITS.get(part, part) if column == "geometry" else f"{column}.{part}"

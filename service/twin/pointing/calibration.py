@@ -19,6 +19,7 @@ from model.plant_model import PlantModel
 from model.pointing import CalibratedMount, FieldMounts, Reading, calibrate_field
 from model.pointing.plan import Proposal, best_sun, plan
 from model.pointing.report import clock_to_json, day_of, mount_to_json
+from model.times import format_minute
 from service import store
 from service.base.errors import ConflictError
 from service.store.columns import now
@@ -30,7 +31,7 @@ from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.heliostats.stored_mount import load_mount, mount_of, true_sun, with_drive_zeros
 from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.epochs import waiting_epochs
+from service.twin.surfaces.epochs import Epoch, waiting_epochs
 
 Array = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ def store_mounts(session: Session, calibrated: StoreMounts) -> dict[str, MountRo
     return rows
 
 
-class Readings(NamedTuple):
+class StoredReadings(NamedTuple):
     """Readings, and the reasons for unusable measurements by identifier."""
 
     usable: list[Reading]
@@ -169,7 +170,7 @@ def load_readings(
     rows: Sequence[MeasurementRow],
     model: PlantModel,
     targets: Mapping[str, TargetPlane],
-) -> Readings:
+) -> StoredReadings:
     """Convert measurements to readings of a mount under the model's sun."""
     readings, useless = [], {}
     for row in rows:
@@ -177,7 +178,7 @@ def load_readings(
             readings.append(_reading(heliostat, row, model, targets))
         except ModelError as error:
             useless[row.identifier] = str(error)
-    return Readings(readings, useless)
+    return StoredReadings(readings, useless)
 
 
 def _reading(
@@ -255,12 +256,13 @@ def plan_candidates(states: Sequence[CalibrationState], most: int) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationSlot:
-    """A planned photograph with its time and sun [deg]."""
+    """A planned photograph with its time, sun [deg] and the reason for its heliostat in words."""
 
     proposal: Proposal
     moment: datetime
     azimuth_deg: float
     elevation_deg: float
+    reason: str = ""
 
 
 def make_plan(
@@ -313,7 +315,21 @@ def make_plan(
         chosen = plan(
             heliostats, calibrated, planes, suns, [day_of(moment) for moment, _, _ in days], wanted
         )
-    return [CalibrationSlot(one, *days[one.slot]) for one in chosen]
+    of = {state.name: state for state in states}
+    return [
+        CalibrationSlot(one, *days[one.slot], _reason(of[one.heliostat], wanted.get(one.heliostat)))
+        for one in chosen
+    ]
+
+
+def _reason(state: CalibrationState, epoch: Epoch | None) -> str:
+    """Why a heliostat is photographed, in words."""
+    if epoch is not None:
+        return f"{epoch.said}; {epoch.needs}"
+    if state.newest is None:
+        return "its mount was never calibrated"
+    newest = format_minute(datetime.fromisoformat(state.newest))
+    return f"its mount is known by {state.measurements} photographs, the last of {newest}"
 
 
 def _suns_above(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session, undefer
 
+from model.changes import find_changes
 from model.errors import ModelError
 from model.pointing import Reading, pointing_error
 from model.pointing.prediction import MIN_MEASUREMENTS
@@ -38,10 +39,11 @@ NEWEST = 8
 # Photographs since the calibration that a trend needs: three in each third.
 _MIN_OF_TREND = 9
 
-# A photograph that is off by more standard deviations is foreign, or the heliostat has moved. Two
-# in a row mean that it has moved.
+# A photograph that is off by more standard deviations is foreign, or the heliostat has moved.
 _FAR = 5.0
-_IN_A_ROW = 2
+
+# Standard deviation of the logarithm of an angle: pi / sqrt(24) for a Rayleigh distribution.
+_LOG_RAYLEIGH = 0.64
 
 # Photographs since the calibration that are read, the newest.
 _MAX_READ = 256
@@ -131,20 +133,20 @@ def pointing_state(
         step = mount.steps[-1]
         begin, size = mount.days[step.after], 1e3 * float(np.linalg.norm(step.zeros))
         moved = DriveStep(moment_of(mount.days[step.before]), moment_of(begin), size, True)
-    trend = None
+    trend, known = None, days >= begin
+    days, off = days[known], off[known]
     if newer:
         apart, far = _forecast_errors(stored, newer)
-        new_days = np.array([one.day for one in newer])
-        first = int(np.nonzero(~far)[0].max(initial=-1)) + 1
-        if len(newer) - first >= _IN_A_ROW:
-            before = new_days[first - 1] if first else mount.days[-1]
-            begin = new_days[first]
-            size = float(np.median(apart[first:]))
-            if np.isfinite(before):  # else it may have been off from the first photograph on
-                moved = DriveStep(moment_of(before), moment_of(begin), size, False)
-        trend = _trend(apart)
-        days, off = np.concatenate([days, new_days]), np.concatenate([off, apart])
-    days, off = days[days >= begin], off[days >= begin]
+        calibrated, trend = len(days), _trend(apart)
+        days, off = np.concatenate([days, [one.day for one in newer]]), np.append(off, apart)
+        logs = np.log(np.maximum(off, 1e-3)).tolist()
+        for change in find_changes([moment_of(day) for day in days], logs, _LOG_RAYLEIGH):
+            is_far = far[max(change.first - calibrated, 0) :]
+            if change.first >= calibrated and change.max_drop < 0 and np.median(is_far) > 0:
+                size = float(np.median(off[change.first :]))
+                moved = DriveStep(change.since, change.until, size, False)
+                days, off = days[change.first :], off[change.first :]
+                break
     is_enough = off.size >= MIN_MEASUREMENTS and (newer or mount.prediction is not None)
     error = float(np.median(off[-NEWEST:])) if is_enough else None
     interval, predicted = None, mount.prediction

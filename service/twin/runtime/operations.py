@@ -79,10 +79,11 @@ def predict(
 ) -> SurfacePrediction:
     """Predict the mirror surface of a heliostat from its images.
 
-    The network predicts it alone, or the prediction is refined through the tracer. Mirrors that
-    none of the ``networks`` was trained for are refined in either case: see
-    `SurfacePrediction.method`. ``progress`` receives the progress of the refinement. An exception
-    that it raises stops the refinement.
+    The network predicts it alone, or the prediction is refined through the tracer. If few images
+    agree better with the network's surface than with one refined from the others, the network's is
+    the answer. Mirrors that none of the ``networks`` was trained for are refined in either case:
+    see `SurfacePrediction.method`. ``progress`` receives the progress of the refinement. An
+    exception that it raises stops the refinement.
 
     Raises
     ------
@@ -101,6 +102,8 @@ def predict(
     refined = refine(
         heliostat, observations, model, start, prior=predictor.prior, progress=progress
     )
+    if refined.is_start_better:
+        return predictor.predict(heliostat, few, model)
     return replace(refined, weights=f"{predictor.name}+{refined.weights}")
 
 

@@ -101,11 +101,13 @@ class Operations(Protocol):
         """Find effects that photographs require and the declared model lacks."""
 
 
-def load_operations(networks: Path) -> Operations:
-    """Import the module `service.twin.runtime.operations`, with the networks of a folder.
+def load_operations(networks: Path, effects_from: Sequence[Path] = ()) -> Operations:
+    """Import the module `service.twin.runtime.operations`, with the networks of a folder and the
+    effects of files and installed packages (`model.effects.own`).
 
     It is imported late because it loads the tracer's libraries.
     """
+    import_module("model.effects.own").load_effects(effects_from)
     module = import_module("service.twin.runtime.operations")
     return cast(Operations, module.ModelOperations(networks))
 
@@ -146,7 +148,7 @@ class Runtime:
             settings=settings,
             database=Database(settings.database, settings.connections),
             images=ImageStore(settings.data_dir / "images"),
-            operations=operations or load_operations(settings.networks),
+            operations=operations or load_operations(settings.networks, settings.effects_from),
             compute_slots=ComputeSlots(settings.parallel_computations),
             decoding_slots=ComputeSlots(settings.parallel_computations + 1),
         )

@@ -1,7 +1,7 @@
 """What adopting the result of a study would change in forecasts, before it is adopted."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from statistics import fmean
 
@@ -10,12 +10,8 @@ from service import store
 from service.base.errors import SKIPPED, NotFoundError
 from service.base.fields import Sun
 from service.store.tables import StudyRow
-from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_flux
-from service.twin.heliostats.measurements import (
-    HeliostatContext,
-    heights_of,
-    load_heliostat_context,
-)
+from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
+from service.twin.heliostats.measurements import heights_of, load_heliostat_context
 from service.twin.plant import model_versions
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
@@ -133,21 +129,16 @@ def forecast_changes(runtime: Runtime, number: int) -> Changes:
 def _change(runtime: Runtime, study: StudyRow, name: str) -> ForecastChange:
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, name)
-        after = replace(twin, model=model_versions.model_if_adopted(session, study))
+        after = model_versions.model_if_adopted(session, study)
         newest = store.recent_measurements(session, twin.row, 1)
         if not newest:
             raise NotFoundError(f"heliostat {name} has no photograph any more")
         row, surface = newest[0], store.find_surface_at(session, twin.row)
-        request = ForecastRequest(
-            name,
-            Sun(azimuth_deg=row.sun_azimuth_deg, elevation_deg=row.sun_elevation_deg),
-            row.taken_at,
-            receiver=store.target_plane(row.target),
-            resolution=_RESOLUTION,
-        )
-        target, heights = row.target.name, heights_of(surface)
-
-    def trace(context: HeliostatContext) -> Forecast:
-        return trace_flux(runtime, context, control_points(twin.heliostat, heights), request)
-
-    return ForecastChange(name, target, row.taken_at, trace(twin), trace(after))
+        plane = store.target_plane(row.target)
+        points = control_points(twin.heliostat, heights_of(surface))
+        sun = Sun(azimuth_deg=row.sun_azimuth_deg, elevation_deg=row.sun_elevation_deg)
+    setup = aimed_setup(twin.heliostat, points, sun, row.taken_at, plane)
+    before, then = (
+        trace_flux(runtime, setup, model, plane, _RESOLUTION) for model in (twin.model, after)
+    )
+    return ForecastChange(name, plane.name, row.taken_at, before, then)

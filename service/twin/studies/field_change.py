@@ -6,14 +6,15 @@ cleaned. So some photographs of each day are forecast with and without an effect
 
 import json
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import date, datetime
 from typing import NamedTuple
 
 import numpy as np
+from cachetools import LRUCache
 from pydantic import BaseModel, Field
-from sqlalchemy import func, select
+from sqlalchemy import extract, func, select
 from sqlalchemy.orm import Session
 
 from model.effects import Always, ByDay, Effect
@@ -22,6 +23,7 @@ from model.metrics import flux_accuracies
 from model.study.judging import Gain, few_gain, find_end, is_worse
 from service import store
 from service.base.errors import ConflictError, ServiceError
+from service.base.fields import MeanGain
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     accepted_measurement,
@@ -31,18 +33,22 @@ from service.twin.heliostats.measurements import (
 from service.twin.plant import model_versions
 from service.twin.plant.model_versions import Ends, ModelVersion, effect_key, effect_text, without
 from service.twin.runtime.runtime import Runtime
+from service.twin.studies.states import study_states
 from service.twin.surfaces.accuracy import forecasts_of
 
 _DAYS, _A_DAY = 60, 6  # days with photographs, and photographs of each
+_MOST = 50_000  # newest photographs that they are chosen from
+_REMEMBERED = 64  # pairs of models whose gains are remembered
 
 
 class SampledPhotograph(NamedTuple):
-    """A photograph of a known time."""
+    """A photograph of a known time, and the active version of its heliostat's surface."""
 
     id: int
     identifier: str
     heliostat: str
     taken_at: datetime
+    surface: int | None
 
 
 def sample_photographs(
@@ -53,56 +59,69 @@ def sample_photographs(
     They are of all heliostats with a surface, or of some of them. An ideal mirror would gain by
     every effect that spreads its light.
     """
-    row, found = MeasurementRow, list[SampledPhotograph]()
+    row = MeasurementRow
     has_surface = row.heliostat_id.in_(select(SurfaceRow.heliostat_id))
-    chosen = [row.accepted, row.arrays.is_not(None), has_surface]
+    chosen = [row.accepted, row.arrays.is_not(None), row.taken_at.is_not(None), has_surface]
     if heliostats is not None:
         numbers = select(HeliostatRow.id).where(HeliostatRow.name.in_(heliostats))
         chosen.append(row.heliostat_id.in_(numbers))
-    newest = select(func.max(row.taken_at)).where(*chosen)
-    query = select(row.id, row.identifier, HeliostatRow.name, row.taken_at).where(*chosen)
-    query = query.join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
-    before = session.scalar(newest)
-    for _ in range(_DAYS):
-        if before is None:
-            break
-        day = before.replace(hour=0, minute=0, second=0, microsecond=0)
-        taken = query.where(row.taken_at >= day, row.taken_at <= before)
-        # Ids times a prime, modulo another: in no order of heliostats or hours.
-        scattered = taken.order_by(row.id * 7919 % 1009, row.id).limit(_A_DAY)
-        found += [
-            SampledPhotograph(number, identifier, name, at)
-            for number, identifier, name, at in session.execute(scattered)
-            if at is not None
-        ]
-        before = session.scalar(newest.where(row.taken_at < day))
-    return found
+    second = extract("epoch", row.taken_at)
+    columns = (row.id, row.identifier, row.heliostat_id, row.taken_at)
+    newest = select(*columns, (second - second % 86400).label("day")).where(*chosen)
+    of = newest.order_by(row.taken_at.desc()).limit(_MOST).subquery().c
+    # Ids times a prime, modulo another: in no order of heliostats or hours.
+    scattered = (of.id * 7919 % 1009, of.id)
+    age = func.dense_rank().over(order_by=of.day.desc())
+    place = func.row_number().over(partition_by=of.day, order_by=scattered)
+    ranked = select(*of, age.label("age"), place.label("place")).subquery().c
+    query = select(
+        ranked.id, ranked.identifier, HeliostatRow.name, ranked.taken_at, HeliostatRow.id
+    )
+    query = query.join(HeliostatRow, HeliostatRow.id == ranked.heliostat_id)
+    query = query.where(ranked.age <= _DAYS, ranked.place <= _A_DAY)
+    active = store.active_versions(session)
+    found = session.execute(query.order_by(ranked.age, ranked.place))
+    return [
+        SampledPhotograph(photograph, identifier, name, at, active.get(heliostat))
+        for photograph, identifier, name, at, heliostat in found
+        if at is not None
+    ]
 
 
-def accuracy_gains(
-    runtime: Runtime,
-    photographs: Iterable[SampledPhotograph],
-    before: ModelVersion,
-    after: ModelVersion,
-) -> dict[int, float]:
-    """Changes of accuracy [1] from one model to another with the active surfaces, by row id.
+class EffectGains:
+    """Changes of accuracy from one model to another; that of a photograph is computed once."""
 
-    Photographs that both forecast alike have zero. Those that cannot be forecast are left out.
-    """
-    old, new = ({effect_text(e): e for e in model.effects} for model in (before, after))
-    differing = [effect for key, effect in (old | new).items() if (key in old) != (key in new)]
-    gains, changed = dict[int, float](), defaultdict[str, list[SampledPhotograph]](list)
-    for one in photographs:
-        if any(effect.at(one.taken_at, one.heliostat) is not None for effect in differing):
-            changed[one.heliostat].append(one)
-        else:
-            gains[one.id] = 0.0
-    for name, taken in changed.items():
-        try:
-            gains |= _gains_of_heliostat(runtime, name, taken, before, after)
-        except (ModelError, ServiceError):  # deleted since, or not traceable
-            continue
-    return gains
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._known: LRUCache[str, dict[SampledPhotograph, float]] = LRUCache(_REMEMBERED)
+
+    def of(
+        self, photographs: Sequence[SampledPhotograph], before: ModelVersion, after: ModelVersion
+    ) -> dict[int, float]:
+        """Changes of accuracy [1] with the active surfaces, by row id.
+
+        Photographs that both models forecast alike have zero. Those that cannot be forecast are
+        left out.
+        """
+        old, new = ({effect_text(e): e for e in model.effects} for model in (before, after))
+        # A version of another number may have other cameras, which measure photographs again.
+        known = self._known.setdefault(str((before.number, sorted(old), sorted(new))), {})
+        differing = [effect for key, effect in (old | new).items() if (key in old) != (key in new)]
+        gains, changed = dict[int, float](), defaultdict[str, list[SampledPhotograph]](list)
+        for one in photographs:
+            if one in known:
+                gains[one.id] = known[one]
+            elif any(effect.at(one.taken_at, one.heliostat) is not None for effect in differing):
+                changed[one.heliostat].append(one)
+            else:
+                gains[one.id] = 0.0
+        for name, taken in changed.items():
+            try:
+                gains |= _gains_of_heliostat(self._runtime, name, taken, before, after)
+            except (ModelError, ServiceError):  # deleted since, or not traceable
+                continue
+        known |= {one: gains[one.id] for one in photographs if one.id in gains}
+        return gains
 
 
 def _gains_of_heliostat(
@@ -128,11 +147,9 @@ def _gains_of_heliostat(
     return dict(zip([one.id for one in photographs], (new - old).tolist(), strict=True))
 
 
-class AccuracyGain(BaseModel):
-    """Mean change of accuracy [1] with its 95 % interval, on some photographs."""
+class AccuracyGain(MeanGain):
+    """A gain on some photographs."""
 
-    mean: float = Field(description="Mean change of accuracy [1].")
-    ci95: tuple[float, float] = Field(description="Its 95 % interval [1].")
     photographs: int = Field(description="Number of photographs.")
 
     @classmethod
@@ -166,14 +183,20 @@ def photographs_of_effect(
 ) -> list[SampledPhotograph]:
     """Choose photographs on which an effect acts; none if all are of its study, or older.
 
-    Effects by day are left out: their usual value is none of a single day.
+    On days without a fitted photograph an effect by day has its usual value, which only later ones
+    judge.
     """
-    if isinstance(effect.scope, ByDay):
-        return []
-    names = effect.scope.heliostats or effect.heliostats
-    sample = sample_photographs(session, names)
+    scope = effect.scope
+    if isinstance(scope, ByDay):
+        sample = [
+            one
+            for one in sample_photographs(session)
+            if _is_later(one, study) or one.taken_at.date() in scope.by_day
+        ]
+    else:
+        sample = sample_photographs(session, scope.heliostats or effect.heliostats)
     acting = [one for one in sample if effect.at(one.taken_at, one.heliostat) is not None]
-    return acting if acting and _is_later(acting[0], study) else []
+    return acting if any(_is_later(one, study) for one in acting) else []
 
 
 def _is_later(photograph: SampledPhotograph, study: StudyRow) -> bool:
@@ -194,7 +217,7 @@ def find_contradiction(
         return None
     return ContradictedEffect(
         effect=effect_key(effect),
-        study=study.id,
+        study=study.id or 0,
         until=end.day,
         can_end=end.day > model_versions.first_day(effect, study),
         gain=AccuracyGain.of(end.gain, sum(day >= end.day for day in days)),
@@ -230,9 +253,15 @@ class FieldChange(BaseModel):
         return "; ".join([said, *(one.in_words for one in self.contradicted)])
 
 
-def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -> FieldChange:
+def read_field_change(
+    runtime: Runtime,
+    study: int | StudyRow,
+    ends: Ends | None = None,
+    known: EffectGains | None = None,
+) -> FieldChange:
     """Forecast photographs with and without the effects of a study, that have some ``ends``.
 
+    ``study`` is its number, or a study that is not stored. ``known`` gains are not computed again.
     If it is adopted, and no ends are given, that is the current model with and without them.
 
     Raises
@@ -245,13 +274,13 @@ def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -
         If ``ends`` are not of its effects.
     """
     with runtime.database.reading() as session:
-        study = store.get_study(session, number)
+        study = store.get_study(session, study) if isinstance(study, int) else study
         before = model_versions.get_model(session)
         after = model_versions.model_if_adopted(session, study, ends)
         found = model_versions.effects_of_study(study, ends)
         if not found:
-            raise ConflictError(f"study {number} found no effect; adopting it changes nothing")
-        if not ends and model_versions.find_adopted(session, number) is not None:
+            raise ConflictError(f"study {study.id} found no effect; adopting it changes nothing")
+        if not ends and model_versions.find_adopted(session, study.id) is not None:
             # They may have got an end since.
             plain = {effect_text(replace(effect, scope=Always())) for effect in found}
             found = tuple(
@@ -262,24 +291,22 @@ def read_field_change(runtime: Runtime, number: int, ends: Ends | None = None) -
             before, after = without(before, found), before
         sample = sample_photographs(session)
         acting = [photographs_of_effect(session, effect, study) for effect in found]
-    gains = accuracy_gains(runtime, sample, before, after)
+    known = known or EffectGains(runtime)
+    gains = known.of(sample, before, after)
     later = [gains[one.id] for one in sample if one.id in gains and _is_later(one, study)]
     contradicted = [
         find_contradiction(
-            effect,
-            study,
-            photographs,
-            accuracy_gains(runtime, photographs, without(after, [effect]), after),
+            effect, study, photographs, known.of(photographs, without(after, [effect]), after)
         )
         for effect, photographs in zip(found, acting, strict=True)
         if model_versions.is_open(effect)
     ]
-    known, change = [one for one in contradicted if one is not None], few_gain(np.array(later))
+    harmful, change = [one for one in contradicted if one is not None], few_gain(np.array(later))
     return FieldChange(
         whole=AccuracyGain.of(few_gain(np.array(list(gains.values()))), len(gains)),
         later=AccuracyGain.of(change, len(later)),
-        is_harmful=is_worse(change) or bool(known),
-        contradicted=known,
+        is_harmful=is_worse(change) or bool(harmful),
+        contradicted=harmful,
     )
 
 
@@ -287,44 +314,71 @@ class ContradictionError(ConflictError):
     """The effects of a study make photographs after it significantly worse."""
 
 
-def require_no_contradiction(runtime: Runtime, number: int, ends: Ends) -> None:
+def require_no_contradiction(runtime: Runtime, study: int | StudyRow, ends: Ends) -> None:
     """Raise ContradictionError if a study makes photographs after it significantly worse."""
-    change = read_field_change(runtime, number, ends)
+    change = read_field_change(runtime, study, ends)
     if not change.is_harmful:
         return
     until = {key: day.isoformat() for key, day in change.ends.items()}
     remedy = (
         f'adopt it with this end, {{"until": {json.dumps(until)}}}'
-        if until
+        if until and isinstance(study, int)
         else "make another study"
     )
+    name = f"study {study}" if isinstance(study, int) else "this report"
     raise ContradictionError(
-        f"study {number}: {change.in_words}; {remedy}, or force it and give the reason to adopt it"
+        f"{name}: {change.in_words}; {remedy}, or force it and give the reason to adopt it"
         " nevertheless"
     )
 
 
+class AdoptableStudy(NamedTuple):
+    """The newest study, whose effects help: what they change with their ``ends``, if any."""
+
+    study: StudyRow
+    ends: dict[str, date]
+    change: FieldChange
+
+
+class EffectFindings(NamedTuple):
+    """What photographs say of effects: adopted ones, and those of the newest study."""
+
+    contradicted: list[ContradictedEffect]
+    adoptable: AdoptableStudy | None = None
+
+
 class EffectWatch:
-    """Gains of adopted effects on photographs; each is computed once."""
+    """Compares effects with photographs; gains are computed once."""
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
-        self._gains: dict[tuple[int, str], dict[int, float]] = {}
+        self._runtime, self._gains = runtime, EffectGains(runtime)
 
-    def read(self) -> list[ContradictedEffect]:
-        """Find the effects of the current model that photographs after their studies contradict."""
+    def read(self) -> EffectFindings:
+        """Find adopted effects that later photographs contradict, and a study to adopt."""
         with self._runtime.database.reading() as session:
             adopted = model_versions.adopted_effects(session)
             model = model_versions.get_model(session) if adopted else None
             photographs = [photographs_of_effect(session, a.effect, a.study) for a in adopted]
-        known, self._gains, found = self._gains, {}, []
+        found = []
         for one, taken in zip(adopted, photographs, strict=True):
             assert model is not None
-            key = (model.number, effect_text(one.effect))
-            gains = known.get(key, {})
-            new = [photograph for photograph in taken if photograph.id not in gains]
-            reduced = without(model, [one.effect])
-            gains = gains | accuracy_gains(self._runtime, new, reduced, model)
-            self._gains[key] = {photo.id: gains[photo.id] for photo in taken if photo.id in gains}
+            gains = self._gains.of(taken, without(model, [one.effect]), model)
             found.append(find_contradiction(one.effect, one.study, taken, gains))
-        return [one for one in found if one is not None]
+        return EffectFindings([one for one in found if one is not None], self._find_adoptable())
+
+    def _find_adoptable(self) -> AdoptableStudy | None:
+        """The newest study if REST adopts it without force, and photographs are better with it."""
+        with self._runtime.database.reading() as session:
+            study = store.newest_study(session)
+            state = None if study is None else study_states(session, [study])[study.id]
+        if study is None or state is None or state.state != "candidate":
+            return None
+        if state.questions or state.warnings or state.findings.is_correction:
+            return None
+        ends = dict[str, date]()
+        change = read_field_change(self._runtime, study.id, None, self._gains)
+        if change.is_harmful and change.ends:
+            ends = change.ends
+            change = read_field_change(self._runtime, study.id, ends, self._gains)
+        is_better = not change.is_harmful and change.whole.ci95[0] > 0
+        return AdoptableStudy(study, ends, change) if is_better else None

@@ -10,6 +10,7 @@ from service import store
 from service.store.results import StudyFindings
 from service.store.tables import ModelRow, StudyRow
 from service.twin.plant import model_versions
+from service.twin.plant.adoption_rules import names_of, why_refused
 from service.twin.plant.open_questions import OpenQuestion, open_questions
 
 AdoptionState = Literal["active", "replaced", "withdrawn", "candidate", "nothing_to_adopt"]
@@ -20,7 +21,8 @@ class StudyState:
     """A study's findings, and the newest version adopted from it.
 
     ``state`` is "replaced" if a later version is current. ``warnings`` are the conflicts that
-    adoption by force ignores. ``current`` is the number of the current version.
+    adoption by force ignores. ``current`` is the number of the current version. ``refusal`` says
+    why it cannot be adopted, None if it can. ``adopts`` names what adoption adds.
     """
 
     findings: StudyFindings
@@ -29,6 +31,13 @@ class StudyState:
     questions: list[OpenQuestion]
     warnings: list[str]
     current: int
+    refusal: str | None
+    adopts: list[str]
+
+    @property
+    def is_adoptable(self) -> bool:
+        """Whether it can be adopted, and is not."""
+        return self.refusal is None and self.state in ("candidate", "withdrawn")
 
     @property
     def adopted(self) -> int | None:
@@ -50,17 +59,16 @@ def study_states(session: Session, rows: Sequence[StudyRow]) -> dict[int, StudyS
 def _state(
     row: StudyRow, findings: StudyFindings, version: ModelRow | None, current: int
 ) -> StudyState:
-    state: AdoptionState = "candidate" if findings.effects else "nothing_to_adopt"
+    refusal = why_refused(findings)
+    state: AdoptionState = "candidate" if refusal is None else "nothing_to_adopt"
     if version is not None:
         is_active = version.number == current
         state = "withdrawn" if version.withdrawn_at else "active" if is_active else "replaced"
     warnings = []
-    if row.verdict != "effect":
-        warnings.append("its verdict does not rest on its effects")
     if row.model != current:
         warnings.append(
             f"it was made with version {row.model} of the model, and would replace version"
             f" {current}, which is current"
         )
-    questions = open_questions(findings.effects, findings.unexplained_share)
-    return StudyState(findings, version, state, questions, warnings, current)
+    questions, adopts = open_questions(findings), names_of(findings)
+    return StudyState(findings, version, state, questions, warnings, current, refusal, adopts)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.effects import CATALOGUE, effects_from_json
@@ -25,9 +25,10 @@ from service import store
 from service.base.arrays import to_json_value
 from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
 from service.base.fields import Model, Moment, Name, StudyReport, Text, Whole
-from service.base.progress import Report, Steps, no_report
+from service.base.progress import NamedSteps, Report, no_report
 from service.base.validation_messages import format_validation_error
 from service.drawing.study_report import study_body
+from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     HeliostatContext,
@@ -323,8 +324,9 @@ def study_store(runtime: Runtime, request: StudyIn, report: Report = no_report) 
     options = StudyOptions()
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
-    most = (len(options.candidates) + 1) * options.most  # scopes are searched after the effects
-    steps = Steps(most, report, "fits, at most")
+    # Scopes are searched after the effects, halves and terms outside the catalogue at the end.
+    most = (len(options.candidates) + 1) * options.most + 2
+    steps = NamedSteps(most, report, "fits, at most")
     options = replace(options, between=steps.alive)
 
     def step(name: str) -> None:
@@ -426,6 +428,7 @@ def row_of_report(document: Any, name: str, model: ModelVersion, actor: str) -> 
     """
     report = parse_report(document, name)
     return StudyRow(
+        created_at=now(),
         created_by=actor,
         options={"report": name},
         heliostats=sorted({key.partition("/")[0] for key in report.before.per_image}),
@@ -436,3 +439,13 @@ def row_of_report(document: Any, name: str, model: ModelVersion, actor: str) -> 
         report=to_json_value(document),
         skipped=report.skipped,
     )
+
+
+def date_report(session: Session, row: StudyRow) -> None:
+    """Set the times of a report's first and last photograph, of those that the store has."""
+    at = MeasurementRow.taken_at
+    identifiers = {key.partition("/")[2] for key in row.report["before"]["per_image"]}
+    query = select(func.min(at), func.max(at)).join(HeliostatRow)
+    query = query.where(HeliostatRow.name.in_(row.heliostats))
+    query = query.where(MeasurementRow.identifier.in_(identifiers))
+    row.first_taken_at, row.last_taken_at = session.execute(query).one()

@@ -55,7 +55,7 @@ _MAX_COMPARED = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class PhotographComparison:
     """A photograph and its forecast.
 
     Attributes
@@ -90,21 +90,33 @@ def photograph_name(row: MeasurementRow) -> str:
     return row.external_id or row.identifier
 
 
-def photographs_of_surface(surface: SurfaceRow | None) -> set[str]:
+def photographs_of_surface(surface: SurfaceRow | store.NewSurface | None) -> set[str]:
     """Names of the photographs that a surface was computed from, deleted ones included."""
-    return (
-        set()
-        if surface is None
-        else {*(photograph_name(row) for row in surface.measurements), *(surface.deleted or ())}
-    )
+    if surface is None:
+        return set()
+    deleted = surface.deleted if isinstance(surface, SurfaceRow) else None
+    return {*(photograph_name(row) for row in surface.measurements), *(deleted or ())}
+
+
+# Photographs with these warnings do not show the mirror's shape.
+_MISLEADING = (SUN_CONTRADICTS_TIME, UNLIKE_HELIOSTAT)
 
 
 def photographs_of_epoch(
     session: Session, heliostat: HeliostatRow, epoch: Period
 ) -> list[MeasurementRow]:
-    """The newest photographs that may judge a surface of an epoch, newest first."""
+    """The newest photographs that may judge a surface of an epoch, newest first.
+
+    Misleading ones may only if there are no others.
+    """
     most = _LOOKED_THROUGH * RECENT
-    return store.recent_measurements(session, heliostat, most, epoch.since, epoch.until)
+    recent = store.recent_measurements(session, heliostat, most, epoch.since, epoch.until)
+    return [row for row in recent if not is_misleading(row)] or recent
+
+
+def is_misleading(row: MeasurementRow) -> bool:
+    """Whether warnings say that a photograph does not show the mirror's shape."""
+    return any(one["type"] in _MISLEADING for one in row.warnings or ())
 
 
 class HeldOutFirst(NamedTuple):
@@ -137,7 +149,7 @@ def _in_span(session: Session, heliostat: HeliostatRow, span: Period) -> list[Me
 
 def compare(
     runtime: Runtime, name: str, surface: SurfaceRow | None, span: Period | None = None
-) -> list[Comparison]:
+) -> list[PhotographComparison]:
     """Compare a heliostat's newest photographs with forecasts.
 
     The forecasts use a stored surface, or the ideal one if ``surface`` is None. Held-out
@@ -170,7 +182,7 @@ def compare_with(
     twin: HeliostatContext,
     surface: SurfaceRow | None,
     rows: Sequence[MeasurementRow],
-) -> list[Comparison]:
+) -> list[PhotographComparison]:
     """Compare photographs, loaded with their arrays, with forecasts.
 
     The forecasts use a stored surface, or the ideal one if ``surface`` is None.
@@ -179,7 +191,7 @@ def compare_with(
     used = photographs_of_surface(surface)
     forecasts = forecasts_of(runtime, twin, shown, heights_of(surface))
     return [
-        Comparison(
+        PhotographComparison(
             row,
             evidence.centered,
             forecast,
@@ -213,7 +225,7 @@ class Rank:
     photographs: int
 
 
-def rank_of(comparisons: Sequence[Comparison]) -> Rank:
+def rank_of(comparisons: Sequence[PhotographComparison]) -> Rank:
     """Average the accuracies on held-out photographs; others prove nothing."""
     unseen = [comparison.accuracy for comparison in comparisons if not comparison.was_used]
     return Rank(fmean(unseen) if unseen else None, len(unseen))
@@ -225,10 +237,6 @@ class AccuracySeries(NamedTuple):
     rank: Rank
     fall: AccuracyFall | None
     accuracies: dict[str, float]
-
-
-# Photographs with these warnings do not show the mirror's shape.
-_MISLEADING = (SUN_CONTRADICTS_TIME, UNLIKE_HELIOSTAT)
 
 
 def accuracy_series(
@@ -257,10 +265,7 @@ def accuracy_series(
     unseen = [row for row in rows if photograph_name(row) not in used]
     newest = [accuracies[str(row.id)] for row in unseen[:RECENT]]
     dated = sorted(
-        (row.taken_at, accuracies[str(row.id)])
-        for row in unseen
-        if row.taken_at is not None
-        and not any(one["type"] in _MISLEADING for one in row.warnings or ())
+        (row.taken_at, accuracies[str(row.id)]) for row in unseen if row.taken_at is not None
     )
     fall = find_accuracy_fall([at for at, _ in dated], [value for _, value in dated])
     rank = Rank(fmean(newest) if newest else None, len(newest))
@@ -295,7 +300,7 @@ class ComparisonKey:
 class ComparisonResult:
     """Comparisons with photographs, or in ``trouble`` why there are none."""
 
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[PhotographComparison, ...] = ()
     trouble: str | None = None
 
 

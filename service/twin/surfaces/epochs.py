@@ -94,7 +94,10 @@ def find_accuracy_fall(
 
 @dataclass(frozen=True)
 class DayOfOthers:
-    """Photographs of other heliostats on a day: number, heliostats, accuracy [1], usual one [1]."""
+    """Photographs of other heliostats on a day: number, heliostats, median accuracy [1].
+
+    ``usual`` [1] is that median less the median change from each heliostat's mean of other days.
+    """
 
     photographs: int
     heliostats: int
@@ -102,9 +105,14 @@ class DayOfOthers:
     usual: float
 
     @property
+    def drop(self) -> float:
+        """How much worse they were forecast than usual [1]."""
+        return self.usual - self.accuracy
+
+    @property
     def is_worse(self) -> bool:
         """Whether they were forecast much worse than usual."""
-        return self.usual - self.accuracy >= DROP
+        return self.drop >= DROP
 
 
 def others_on(
@@ -124,14 +132,15 @@ def _others_on(session: Session, heliostat: int, day: date, zone: ZoneInfo) -> D
     found = session.execute(query.limit(_OF_A_DAY)).all()
     if len(found) < MIN_OTHERS:
         return None
+    means = select(row.heliostat_id, func.avg(row.forecast_accuracy)).group_by(row.heliostat_id)
     of = {number for number, _ in found}
-    usual = select(func.avg(row.forecast_accuracy)).where(
-        row.heliostat_id.in_(of), *is_other, ~is_of_day
-    )
-    mean = session.scalar(usual)
-    if mean is None:
+    rows = session.execute(means.where(row.heliostat_id.in_(of), *is_other, ~is_of_day))
+    usual = {number: mean or 0.0 for number, mean in rows}
+    drops = [usual[number] - (value or 0.0) for number, value in found if number in usual]
+    if not drops:
         return None
-    return DayOfOthers(len(found), len(of), median(value or 0.0 for _, value in found), mean)
+    accuracy = median(value or 0.0 for _, value in found)
+    return DayOfOthers(len(found), len(of), accuracy, accuracy + median(drops))
 
 
 def fell_with_others(days: Iterable[date], others: Mapping[date, DayOfOthers]) -> bool:

@@ -4,7 +4,7 @@ Both are compared on the same photographs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from model.metrics import flux_accuracy
 from model.study.judging import Gain, few_gain
 from service import store
 from service.base.choices import Method
+from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import MeasurementRow, SurfaceRow
@@ -85,7 +86,7 @@ def precedence_of(source: str, trusted: bool | None, is_outdated: bool = False) 
 def evaluate_surface(
     runtime: Runtime, twin: HeliostatContext, active: SurfaceRow, new: NewSurface
 ) -> Evaluation:
-    """Compare a predicted surface with the active one, on photographs of its epoch.
+    """Compare a new surface with the active one, on photographs of its epoch.
 
     At least `MIN_HELD_OUT` held-out photographs decide, if they distinguish the two surfaces
     significantly. But a surface that is not trusted never replaces a measured one. Otherwise the
@@ -104,7 +105,7 @@ def evaluate_surface(
 
 
 def evaluate_first_surface(runtime: Runtime, twin: HeliostatContext, new: NewSurface) -> Evaluation:
-    """Compare a predicted surface with the ideal mirror, if no surface is active.
+    """Compare a new surface with the ideal mirror, if no surface is active.
 
     At least `MIN_HELD_OUT` held-out photographs decide. If there are fewer, surfaces from parts of
     the photographs judge the rest, and the reason says so.
@@ -116,29 +117,29 @@ def evaluate_first_surface(runtime: Runtime, twin: HeliostatContext, new: NewSur
 
 
 def justify_by_hand(runtime: Runtime, name: str, version: int, reason: str) -> Justification:
-    """A person's reason, with what photographs of the version's epoch say of it.
+    """A person's reason, with what the photographs say that judge each new surface.
 
-    They are photographs that neither it nor the active surface was computed from.
+    If fewer than `MIN_HELD_OUT` are unseen, the last comparison of the two surfaces counts, since
+    another cross-validation may take minutes. Without one it is made.
     """
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, name)
         active = store.find_surface_at(session, twin.row)
         chosen = store.get_surface(session, twin.row, version)
         seen = photographs_of_surface(active) | photographs_of_surface(chosen)
-        rows, unseen = held_out_first(session, twin.row, seen, epoch_of(session, twin.row, chosen))
-    if not unseen:
+        held_out = held_out_first(session, twin.row, seen, epoch_of(session, twin.row, chosen))
+        known = decisions.find_comparison(session, chosen, active)
+    if known is not None and held_out.n_held_out < MIN_HELD_OUT:
+        return replace(known, reason=reason)
+    if not held_out.rows or (active is not None and chosen.id == active.id):
         return Justification(reason)
-    before, after = (
-        float(_accuracies(runtime, twin, rows[:unseen], heights_of(one)).mean())
-        for one in (active, chosen)
-    )
-    return Justification(reason, before, after, unseen)
+    return _grounds(reason, _judge(runtime, twin, active, chosen))
 
 
 # --- photographs that judge
 # --------------------------------------------------------------------------------------------------
 
-_PARTS = {"network": 4, "refined": 2}
+PARTS = {"network": 4, "refined": 2}
 """Parts of a surface's photographs, each of which is forecast from the others."""
 
 
@@ -157,7 +158,7 @@ class JudgedBy(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Judged:
+class _JudgedSurface:
     """Accuracies (n,) [1] of the active and of the new surface, and how they were found."""
 
     before: Array
@@ -166,33 +167,35 @@ class _Judged:
 
 
 def _judge(
-    runtime: Runtime, twin: HeliostatContext, active: SurfaceRow | None, new: NewSurface
-) -> _Judged:
-    """Accuracies on photographs of the new surface's epoch.
+    runtime: Runtime,
+    twin: HeliostatContext,
+    active: SurfaceRow | None,
+    new: SurfaceRow | NewSurface,
+) -> _JudgedSurface:
+    """Accuracies on photographs of the new surface's epoch, at least one.
 
     They are held out if there are at least `MIN_HELD_OUT`. Otherwise surfaces from parts of the
     photographs judge the rest (cross-validation: Hastie et al. 2009, *The Elements of Statistical
     Learning*, section 7.10).
     """
-    seen, used = photographs_of_surface(active), {photograph_name(row) for row in new.measurements}
+    seen, used = photographs_of_surface(active), photographs_of_surface(new)
     with runtime.database.reading() as session:
         epoch = epoch_of(session, twin.row, new)
         rows, unseen = held_out_first(session, twin.row, seen | used, epoch)
         by_active = held_out_first(session, twin.row, seen, epoch)
     if unseen >= MIN_HELD_OUT:
         before, after = (
-            _accuracies(runtime, twin, rows[:unseen], z) for z in (heights_of(active), new.z)
+            _accuracies(runtime, twin, rows[:unseen], heights_of(one)) for one in (active, new)
         )
-        return _Judged(before, after, JudgedBy(unseen))
+        return _JudgedSurface(before, after, JudgedBy(unseen))
     if by_active.n_held_out:  # the active surface needs no parts
         rows = by_active.rows[: by_active.n_held_out]
-    old = _by_parts(runtime, twin, active, heights_of(active), rows)
-    made = _by_parts(runtime, twin, new, new.z, rows)
+    old, made = (_by_parts(runtime, twin, one, rows) for one in (active, new))
     fair = old.is_fair & made.is_fair
     if not fair.any():
-        return _Judged(old.accuracies, made.accuracies, JudgedBy(0))
+        return _JudgedSurface(old.accuracies, made.accuracies, JudgedBy(0))
     by = JudgedBy(int(fair.sum()), by_parts=True)
-    return _Judged(old.accuracies[fair], made.accuracies[fair], by)
+    return _JudgedSurface(old.accuracies[fair], made.accuracies[fair], by)
 
 
 class _ByParts(NamedTuple):
@@ -206,24 +209,23 @@ def _by_parts(
     runtime: Runtime,
     twin: HeliostatContext,
     surface: SurfaceRow | NewSurface | None,
-    z: Array | None,
     rows: Sequence[MeasurementRow],
 ) -> _ByParts:
     """Accuracies of a surface on photographs.
 
     A photograph that the surface was computed from is forecast by one from other photographs.
     """
-    accuracies = _accuracies(runtime, twin, rows, z)
+    accuracies = _accuracies(runtime, twin, rows, heights_of(surface))
     made_from = [] if surface is None else list(surface.measurements)
     used = {photograph_name(row) for row in made_from}
     is_fair = np.array([photograph_name(row) not in used for row in rows])
-    if is_fair.all() or surface is None or surface.source not in _PARTS:
+    if is_fair.all() or surface is None or surface.source not in PARTS:
         return _ByParts(accuracies, is_fair)
     with runtime.database.reading() as session:
         names = [row.identifier for row in made_from if row.accepted]
         stored = store.get_measurements(session, twin.row, names, arrays=True)
     stored.sort(key=lambda row: row.id)
-    count = min(_PARTS[surface.source], len(stored))
+    count = min(PARTS[surface.source], len(stored))
     for part in range(count if count > 1 else 0):
         left_out = {photograph_name(row) for row in stored[part::count]}
         rest = [row for row in stored if photograph_name(row) not in left_out]
@@ -253,10 +255,13 @@ class Decision(NamedTuple):
     reason: str
 
 
-def _evaluation(against: int | None, decision: Decision, judged: _Judged) -> Evaluation:
+def _evaluation(against: int | None, decision: Decision, judged: _JudgedSurface) -> Evaluation:
+    return Evaluation(against, decision.becomes_active, _grounds(decision.reason, judged))
+
+
+def _grounds(reason: str, judged: _JudgedSurface) -> Justification:
     before, after = float(judged.before.mean()), float(judged.after.mean())
-    grounds = Justification(decision.reason, before, after, len(judged.before))
-    return Evaluation(against, decision.becomes_active, grounds)
+    return Justification(reason, before, after, len(judged.before))
 
 
 def promote_or_reject_first(gains: Array, by: JudgedBy, is_trusted: bool) -> Decision:

@@ -34,7 +34,8 @@ from service.twin.heliostats.measurements import (
 )
 from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime.runtime import Operations, Runtime
-from service.twin.surfaces.epochs import Epoch, current_epoch
+from service.twin.surfaces.accuracy import photographs_of_epoch
+from service.twin.surfaces.epochs import Epoch, current_epoch, epoch_of
 from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface
 
 # Candidates per requested image, because some may contradict the others.
@@ -121,16 +122,37 @@ def compute_surface(
             )
         surface = operations.predict(twin.heliostat, observations, twin.model, method, progress)
     progress(COMPARING, 0, 1)
-    new = _new_surface(twin, surface, rows, begun)
+    return _evaluated(runtime, twin, today, _new_surface(twin, surface, rows, begun))
+
+
+def import_surface(runtime: Runtime, heliostat: str, new: store.NewSurface, actor: str) -> bool:
+    """Store a surface that was imported, and return whether it is new.
+
+    It is judged as predicted ones are, by the photographs of the mirror's present epoch.
+    """
+    with runtime.database.reading() as session:
+        twin = load_heliostat_context(session, heliostat)
+        active = store.find_surface_at(session, twin.row)
+        new = replace(new, epoch_since=None if active is None else active.epoch_since)
+        judges = photographs_of_epoch(session, twin.row, epoch_of(session, twin.row, new))
+    evaluated = _evaluated(runtime, twin, active, new) if judges else Predicted(twin, new)
+    return runtime.database.run_in_transaction(
+        lambda session: keep_surface(session, evaluated, actor).is_new
+    )
+
+
+def _evaluated(
+    runtime: Runtime, twin: HeliostatContext, active: SurfaceRow | None, new: store.NewSurface
+) -> Predicted:
     with runtime.database.reading() as session:
         known = store.find_same_content(session, twin.row, new)
     if known is not None:
         return Predicted(twin, new, known)
-    if today is None:
+    if active is None:
         return _evaluated_first(twin, new, evaluate_first_surface(runtime, twin, new))
-    if _is_older(new, today):
+    if _is_older(new, active):
         return Predicted(twin, new)
-    return Predicted(twin, new, None, evaluate_surface(runtime, twin, today, new))
+    return Predicted(twin, new, None, evaluate_surface(runtime, twin, active, new))
 
 
 def _begin_of_epoch(heliostat: str, epoch: Epoch | None) -> datetime | None:
@@ -225,8 +247,8 @@ def _trust(surface: SurfacePrediction, used: Sequence[MeasurementRow]) -> store.
     ]
     if surface.mahalanobis_distance > TRUSTED_MAHALANOBIS:
         warnings.append(
-            f"the mirror is unlike those known: {surface.mahalanobis_distance:.1f} standard"
-            f" deviations from them, {TRUSTED_MAHALANOBIS} are usual at most"
+            f"the mirror is unlike those known: {surface.mahalanobis_distance:.2f} standard"
+            f" deviations from their mean, and they are within {TRUSTED_MAHALANOBIS:.2f}"
         )
     warnings += surface.warnings
     if not surface.trusted and not warnings:
@@ -248,7 +270,7 @@ class StoredSurface:
 
 
 def keep_surface(session: Session, predicted: Predicted, actor: str) -> StoredSurface:
-    """Store a predicted surface as the heliostat's next version, unless it exists.
+    """Store a new surface as the heliostat's next version, unless it exists.
 
     ``actor`` is who requested it. The surface stays a candidate if the evaluation rejects it, or if
     another surface became active meanwhile.
@@ -262,9 +284,15 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> StoredSu
     today = store.find_surface_at(session, heliostat)
     last = store.newest_prediction(session, heliostat)
     used = store.get_measurements(session, heliostat, [row.identifier for row in new.measurements])
-    row, _ = store.add_surface(session, heliostat, replace(new, measurements=used))
+    is_import = new.source == "measured"
+    row, is_new = store.add_surface(
+        session, heliostat, replace(new, measurements=used), once=is_import
+    )
+    if not is_new:
+        return StoredSurface(row, is_new=False)
     about = {"version": row.version, "model": new.model_version}
-    audit.record(session, actor, "surface.predicted", f"heliostat {heliostat.name}", **about)
+    action = "surface.imported" if is_import else "surface.predicted"
+    audit.record(session, actor, action, f"heliostat {heliostat.name}", **about)
     _carry_acknowledgement(row, last)
     judgement = predicted.judgement
     if judgement is None:

@@ -30,12 +30,12 @@ from service.sources.documents import IMAGE_KINDS
 from service.sources.files import read_file
 from service.sources.folder import MeasurementFolder, measured_heights
 from service.sources.photograph import Photograph
-from service.store import audit
 from service.store.keys import RESERVED
 from service.twin.heliostats.metadata import photograph_with_target
 from service.twin.photographs.repeats import receive
 from service.twin.plant import setup
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.prediction import import_surface
 from service.twin.transfer import history
 
 UNREADABLE = (
@@ -139,7 +139,7 @@ def _import_heliostat(
         measured = _measured_surface(folder, name) if document is None else None
     except InvalidInputError as error:
         skipped[f"{name} surface"] = str(error)
-    counts.update(_put_heliostat(runtime, folder, name, measured, actor))
+    counts.update(_put_heliostat(runtime, folder, name, actor))
 
     def put(key: str, photograph: Photograph, file: Path | None) -> None:
         progress(key)
@@ -160,6 +160,12 @@ def _import_heliostat(
             file = measurement.images[kind]
             if file not in stored:
                 put(f"{measurement.key} {kind}", measurement.photograph(kind), file)
+    if measured is not None:  # after the photographs that judge it
+        try:
+            is_new = import_surface(runtime, name, measured, actor)
+            counts[f"surfaces {store.Change.NEW if is_new else store.Change.UNCHANGED}"] += 1
+        except (ModelError, *UNREADABLE) as error:
+            skipped[f"{name} surface"] = str(error)
     if document is not None:
         n_facets = len(folder.plant.heliostats[name].facets)
 
@@ -204,25 +210,13 @@ def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Count
     return counts
 
 
-def _put_heliostat(
-    runtime: Runtime,
-    folder: MeasurementFolder,
-    name: str,
-    measured: store.NewSurface | None,
-    actor: str,
-) -> list[str]:
-    """Store a heliostat and its measured surface, if any, in one transaction."""
+def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str, actor: str) -> list[str]:
+    """Store a heliostat in one transaction."""
 
     def put(session: Session) -> list[str]:
         by = _authorship(folder, actor)
-        row, change = setup.set_heliostat(session, by, name, folder.properties[name])
-        outcomes = [f"heliostats {change}"]
-        if measured is not None:
-            _, is_new = store.add_surface(session, row, measured, once=True)
-            outcomes.append(f"surfaces {store.Change.NEW if is_new else store.Change.UNCHANGED}")
-            if is_new:
-                audit.record(session, actor, "surface.imported", f"heliostat {name}")
-        return outcomes
+        _, change = setup.set_heliostat(session, by, name, folder.properties[name])
+        return [f"heliostats {change}"]
 
     return runtime.database.run_in_transaction(put)
 

@@ -108,7 +108,7 @@ def predict_again(runtime: Runtime, heliostat: str, actor: str) -> int:
         today = store.find_surface_at(session, store.get_heliostat(session, heliostat))
     method = "network" if today is not None and today.source == "network" else "refined"
     payload = PredictionsIn(heliostats=[heliostat], method=method)
-    return enqueue(runtime, predictions.KIND, payload, actor).id
+    return enqueue(runtime, predictions.KIND, payload, actor).row.id
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements/{measurement}", tags=["measurements"])

@@ -1,52 +1,32 @@
 """Flux forecasts."""
 
-from dataclasses import fields
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Response, status
 from numpy.typing import NDArray
-from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
+from pydantic import BaseModel, Field
 
-from model.plant import Receiver
 from service import store
-from service.base.arrays import pair_or_none
 from service.base.fields import (
-    AnySun,
     CreatedAt,
-    Flag,
     HeliostatOf,
     Id,
-    Model,
     ModelNumber,
-    ModelVersion,
-    MotorPosition,
     Name,
-    Number,
-    Plane,
-    Position,
-    Resolution,
     Rows,
-    SunAt,
     SunPosition,
     Version,
-    VersionIn,
     from_row,
 )
-from service.base.receivers import PlaneReceiverIn, ReceiverIn
 from service.drawing.pictures import flux_picture
 from service.store.listing import Order, Period
 from service.store.tables import ForecastRow
-from service.twin.forecasts.heliostat_forecast import (
-    ForecastRequest,
-    camera_view,
-    flux_of,
-    make_forecast,
-    position_of,
-)
-from service.twin.forecasts.watts import Sunlight, dni_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.alarms.measured_states import read_requested_states
+from service.twin.forecasts.heliostat_forecast import camera_view, flux_of, make_forecast, size_of
+from service.twin.forecasts.requests import ForecastIn
+from service.twin.forecasts.watts import ForecastLosses
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -60,79 +40,6 @@ from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.paging import OrderQuery, Page, Since, Until, page
 from service.web.responses.representation import Maps
-
-
-def _surface_by(value: Any) -> str:
-    """Whether a surface is named by a word or by its version."""
-    return "(word)" if isinstance(value, str) else "(version)"
-
-
-Surface = Annotated[
-    Annotated[Literal["current", "ideal"], Tag("(word)")] | Annotated[VersionIn, Tag("(version)")],
-    Discriminator(_surface_by),
-]
-
-
-class ForecastIn(Model):
-    """A flux map to compute."""
-
-    heliostat: Name
-    target: Name | None = Field(
-        default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
-    )
-    plane: Plane | None = Field(
-        default=None, description="Any plane; either this, `target` or `receiver`."
-    )
-    receiver: ReceiverIn | None = Field(
-        default=None,
-        description=(
-            "Any receiver; either this, `target` or `plane`. The map of a cylinder is unrolled."
-        ),
-    )
-    sun: AnySun
-    aim_point_m: Position | None = Field(
-        default=None, description="Where the heliostat aims [m]; by default the receiver's middle."
-    )
-    motor_position: MotorPosition | None = Field(
-        default=None,
-        description=(
-            "In place of an aim: positions of both motors [steps]. The calibrated mount, as it was"
-            " at the time in `sun`, else the newest, says where they send the light, or the"
-            " heliostat's properties where it was never calibrated."
-        ),
-    )
-    surface: Surface = Field(
-        default="current",
-        description=(
-            "The heliostat's current surface, the ideal one, or a version. A heliostat without a"
-            " surface is forecast by its ideal mirror; the first of `warnings` says so."
-        ),
-    )
-    dni_w_m2: Sunlight = 1000.0
-    resolution: Resolution = (256, 256)
-    window_m: Number | None = Field(
-        default=None,
-        ge=0.01,
-        le=1e3,
-        description=(
-            "Side of a square about the centre of mass to map [m]; else the plane. Planes only."
-        ),
-    )
-    normalised: Flag = Field(
-        default=False, description="Scale the map to a sum of 100 instead of W/m2."
-    )
-    model_version: ModelVersion = None
-
-    @model_validator(mode="after")
-    def _one(self) -> Self:
-        if sum(value is not None for value in (self.target, self.plane, self.receiver)) != 1:
-            raise ValueError("give either target or plane, or receiver")
-        is_whole = not isinstance(self.receiver, PlaneReceiverIn | None)
-        if self.window_m is not None and is_whole:
-            raise ValueError("window_m: the map of such a receiver is all of it; leave it out")
-        if self.aim_point_m is not None and self.motor_position is not None:
-            raise ValueError("give either aim_point_m or motor_position")
-        return self
 
 
 class ForecastReceiverOut(BaseModel):
@@ -161,35 +68,6 @@ class ForecastReceiverOut(BaseModel):
     absorptance: float = Field(
         default=1.0, description="Share of the light on the map that it absorbs [1]."
     )
-
-
-def _factor(description: str) -> Any:
-    """A factor of the losses."""
-    return Field(description=f"{description} [1].")
-
-
-class ForecastLosses(BaseModel):
-    """What becomes of the light on a heliostat, in watts.
-
-    The factors are in the order of the light, and each is the share that is left. Neighbours and
-    tower are not traced, so that shading and blocking are 1.
-    """
-
-    mirror_area_m2: float = Field(description="Area of the facets [m2].")
-    incident_w: float = Field(description="Direct normal irradiance times that area [W].")
-    cosine: float = _factor(
-        "Projection of the mirror towards the sun, less what the effects soiling and blocking take"
-    )
-    shading: float = _factor("Share that is not shaded")
-    blocking: float = _factor("Share that is not blocked")
-    reflectance: float = _factor("Reflectance of mirrors and of the model's optics")
-    cleanliness: float = Field(1.0, description="Share that soiling leaves; here 1 [1].")
-    attenuation: float = _factor("Share that the air leaves")
-    intercept: float = _factor("Share that hits the whole target or receiver, mapped or not")
-    absorptance: float = _factor("Share that it absorbs")
-    optical_efficiency: float = Field(description="Product of the factors [1].")
-    intercepted_w: float = Field(description="Power on the whole target or receiver [W].")
-    absorbed_w: float = Field(description="Power that it absorbs [W].")
 
 
 class ForecastSummary(BaseModel):
@@ -247,15 +125,10 @@ def forecast_summary(row: ForecastRow) -> ForecastSummary:
         ForecastSummary,
         row,
         heliostat=row.heliostat.name,
-        warnings=row.warnings or [],
         surface="ideal" if row.surface is None else "stored",
         surface_version=None if row.surface is None else row.surface.version,
         target=row.target_name,
-        sun={"azimuth_deg": row.sun_azimuth_deg, "elevation_deg": row.sun_elevation_deg},
-        at=row.sun_at,
-        resolution=(row.rows, row.columns),
-        unit="1" if row.normalised else "W/m2",
-        center_of_mass_m=pair_or_none(row.center_right_m, row.center_up_m),
+        **row.document,
     )
 
 
@@ -266,35 +139,16 @@ def forecast_answer(
     flux = flux_of(row, shown)
     if media_type == formats.JSON:
         return json_answer(forecast_summary(row), flux=flux)
-    unit = "flux [% per pixel]" if row.normalised else "W/m²"
-    size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
+    unit = "flux [% per pixel]" if row.document["normalised"] else "W/m²"
     name, title = (
         f"{row.heliostat.name}-forecast-{row.id}",
         f"{row.heliostat.name}, forecast {row.id}",
     )
-    return maps_answer(
-        Maps(name, title, {"flux": flux}, partial(flux_picture, flux, size, unit)), media_type
-    )
+    picture = partial(flux_picture, flux, size_of(row), unit)
+    return maps_answer(Maps(name, title, {"flux": flux}, picture), media_type)
 
 
 router = APIRouter(prefix="/forecasts", tags=["forecasts"])
-
-
-def _given(body: ForecastIn) -> Receiver | None:
-    """The receiver of the request, or None if it names a stored one."""
-    if body.plane is not None:
-        return body.plane.named("plane")
-    return None if body.receiver is None else body.receiver.named("receiver")
-
-
-def _request(runtime: Runtime, body: ForecastIn) -> ForecastRequest:
-    with runtime.database.reading() as session:
-        sun, altitude = position_of(session, body.sun), store.get_plant(session).altitude_m
-    names = {field.name for field in fields(ForecastRequest)} & set(ForecastIn.model_fields)
-    same = {name: getattr(body, name) for name in names - {"sun", "receiver"}}
-    same["dni_w_m2"] = dni_of(body.dni_w_m2, sun.elevation_deg, altitude)
-    sun_at = body.sun.at if isinstance(body.sun, SunAt) else None
-    return ForecastRequest(sun=sun, sun_at=sun_at, receiver=_given(body), **same)
 
 
 @router.post(
@@ -309,7 +163,7 @@ def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) 
     Read the map from the path of the forecast. `POST /v1/jobs/forecasts` superposes the whole
     field, or some heliostats.
     """
-    row = make_forecast(runtime, _request(runtime, request))
+    row = make_forecast(runtime, request, read_requested_states(runtime, request))
     response.headers["Location"] = f"/v1/forecasts/{row.id}"
     return forecast_summary(row)
 

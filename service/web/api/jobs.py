@@ -133,7 +133,8 @@ IdempotencyKey = Annotated[
         alias="Idempotency-Key",
         pattern=r"^[\x21-\x7e]{1,128}$",
         description=(
-            "Any text of the sender's own: the same request with the same key is the same job."
+            "Any text of the sender's own: the same request with the same key is the same job,"
+            " and its second answer has the header `Idempotency-Replayed`."
         ),
     ),
 ]
@@ -147,8 +148,7 @@ def creators(kinds: Kinds) -> APIRouter:
     """Routes that enqueue a job, one for each of ``kinds``."""
     asking = APIRouter(prefix="/jobs", tags=["jobs"])
     for kind in kinds.values():
-        name = kind.name.replace("-", "_")
-        add_creator(asking, kind, f"/{kind.name}", f"post_{name}_job")
+        _add_creator(asking, kind)
         for other, role in ((asking.get, READ), (asking.delete, OPERATE)):
             other(f"/{kind.name}", include_in_schema=False, dependencies=[role])(_only_post)
     return asking
@@ -159,7 +159,7 @@ async def _only_post() -> None:
     raise HTTPException(status.HTTP_405_METHOD_NOT_ALLOWED, headers={"Allow": "POST"})
 
 
-def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> None:
+def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
     """Add a route that enqueues a job of this kind."""
     payload_type = kind.payload
 
@@ -170,13 +170,15 @@ def add_creator(router: APIRouter, kind: Kind[Any], path: str, name: str) -> Non
         response: Response,
         idempotency_key: IdempotencyKey = None,
     ) -> JobOut:
-        row = enqueue(runtime, kind, payload, identity.name, idempotency_key)
+        row, is_new = enqueue(runtime, kind, payload, identity.name, idempotency_key)
         response.headers["Location"] = f"/v1/jobs/{row.id}"
+        if not is_new:
+            response.headers["Idempotency-Replayed"] = "true"
         return job_out(row)
 
     router.post(
-        path,
-        name=name,
+        f"/{kind.name}",
+        name=f"post_{kind.name.replace('-', '_')}_job",
         summary=kind.summary,
         description=f"{kind.summary} Answers at once; follow the job under its Location.",
         status_code=status.HTTP_202_ACCEPTED,

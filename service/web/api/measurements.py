@@ -1,5 +1,8 @@
 """Photographs and their measured flux."""
 
+import json
+from codecs import BOM_UTF8
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
@@ -9,6 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field, Json, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile as StarletteUploadFile
+from starlette.requests import Request
 
 from model.errors import InvalidInputError
 from model.frames import enu_to_wgs84
@@ -32,6 +36,7 @@ from service.base.fields import (
     SunPosition,
     TargetOf,
     from_row,
+    unique_keys,
 )
 from service.drawing.pictures import flux_picture
 from service.sources.photograph import Photograph
@@ -139,6 +144,10 @@ class WarningOut(BaseModel):
             " type."
         ),
     )
+    clock_ahead_h: float | None = Field(
+        default=None,
+        description="How far a clock that explains the recorded sun is ahead [h]; null: none does.",
+    )
     like: str | None = Field(
         default=None,
         description=(
@@ -199,6 +208,35 @@ class MeasurementOut(BaseModel):
             " known."
         )
     )
+
+
+class TakenQuery(Model):
+    """A period, and the length of a page."""
+
+    since: Moment | None = Field(None, description="Only those taken from then on, with zone.")
+    until: Moment | None = Field(None, description="Only those taken before then, with zone.")
+    limit: Limit = 100
+
+    @property
+    def taken(self) -> Period:
+        """The period; without it all are listed, also those of an unknown time."""
+        return Period(self.since, self.until)
+
+
+class MeasurementListQuery(TakenQuery):
+    """Which images of a heliostat are listed."""
+
+    after: MeasurementName | None = Field(None, description="The last id of the page before.")
+    accepted: bool | None = Field(None, description="Only accepted, or only refused ones.")
+    dated: bool | None = Field(None, description="Only those of a known, or of an unknown time.")
+    warned: bool | None = Field(None, description="Only those with warnings, or without any.")
+    kind: Kind | None = Field(None, description="Only images of this kind.")
+    target: Name | None = Field(None, description="Only photographs of this target.")
+    sort: Literal["created_at", "taken_at"] = Field(
+        "created_at",
+        description="By when they came, or were taken: then those of unknown time come last.",
+    )
+    order: OrderQuery = "up"
 
 
 class PostedOut(MeasurementOut):
@@ -291,7 +329,7 @@ def flux_answer(
         document = measurement_out(session, heliostat_name, row)
         return json_answer(document, flux=arrays.get("flux"), centered=arrays.get("centered"))
     whole = "flux" in arrays
-    size = (row.target.width_m, row.target.height_m) if whole else None
+    size = (row.target.geometry["width"], row.target.geometry["height"]) if whole else None
     picture = partial(
         flux_picture, arrays["flux" if whole else "centered"], size, "flux [% per pixel]"
     )
@@ -303,6 +341,9 @@ def flux_answer(
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])
+
+# Generated clients know this media type of files, and no range such as ``image/*``.
+OCTETS = "application/octet-stream"
 
 # Largest metadata that are read from a form part with a file [bytes].
 _MAX_METADATA = 2**16
@@ -342,12 +383,17 @@ def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
 
 
 def _text(part: Any) -> Any:
-    """Text of a form part. Some clients send JSON as a file."""
-    return (
-        part.file.read(_MAX_METADATA + 1)
+    """Text of a form part. Some clients send JSON as a file, and some begin it with a BOM."""
+    text = (
+        part.file.read(_MAX_METADATA + 1).removeprefix(BOM_UTF8)
         if isinstance(part, UploadFile | StarletteUploadFile)
         else part
     )
+    with suppress(
+        json.JSONDecodeError, UnicodeDecodeError, RecursionError
+    ):  # what is no JSON is refused as such
+        json.loads(text, object_pairs_hook=unique_keys)
+    return text
 
 
 def _file(part: Any) -> Any:
@@ -413,49 +459,22 @@ def post_measurement(
 
 @router.get("", responses=problems(404), dependencies=[READ])
 def list_measurements(
-    name: NamePath,
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: Annotated[
-        MeasurementName | None, Query(description="The last id of the page before.")
-    ] = None,
-    accepted: Annotated[
-        bool | None, Query(description="Only accepted, or only refused ones.")
-    ] = None,
-    dated: Annotated[
-        bool | None, Query(description="Only those whose time is known, or is unknown.")
-    ] = None,
-    warned: Annotated[
-        bool | None, Query(description="Only those with warnings, or without any.")
-    ] = None,
-    kind: Annotated[Kind | None, Query(description="Only images of this kind.")] = None,
-    target: Annotated[Name | None, Query(description="Only photographs of this target.")] = None,
-    since: Annotated[
-        Moment | None, Query(description="Only those taken from then on (time with zone).")
-    ] = None,
-    until: Annotated[
-        Moment | None, Query(description="Only those taken before then (time with zone).")
-    ] = None,
-    sort: Annotated[
-        Literal["created_at", "taken_at"],
-        Query(
-            description="By when they came, or were taken: then those of unknown time come last."
-        ),
-    ] = "created_at",
-    order: OrderQuery = "up",
+    name: NamePath, query: Annotated[MeasurementListQuery, Query()], runtime: RuntimeDep
 ) -> Page[MeasurementOut]:
     """List the photographs of a heliostat. They are in the order of arrival, or by time."""
     with runtime.database.reading() as session:
         rows = store.list_measurements(
             session,
             store.get_heliostat(session, name),
-            limit + 1,
-            after,
-            MeasurementFilter(accepted, kind, target, dated, warned, Period(since, until)),
-            Order("id" if sort == "created_at" else sort, order == "down"),
+            query.limit + 1,
+            query.after,
+            MeasurementFilter(
+                query.accepted, query.kind, query.target, query.dated, query.warned, query.taken
+            ),
+            Order("id" if query.sort == "created_at" else query.sort, query.order == "down"),
         )
         items = [measurement_out(session, name, row) for row in rows]
-    return page(items, limit)
+    return page(items, query.limit)
 
 
 @router.get("/{measurement}", responses=problems(404), dependencies=[READ])
@@ -477,7 +496,7 @@ def get_measurement(
         **problems(404, 410),
         200: {
             "description": "The file as it was sent.",
-            "content": {"image/*": {"schema": BINARY}},
+            "content": {"image/*": {"schema": BINARY}, OCTETS: {"schema": BINARY}},
         },
         304: {"description": "If-None-Match names the file, which the client holds already."},
     },
@@ -487,11 +506,15 @@ def get_image(
     name: NamePath,
     measurement: MeasurementPath,
     runtime: RuntimeDep,
+    request: Request,
     if_none_match: Annotated[
         str | None, Header(description="The ETag of a file that is held already.")
     ] = None,
 ) -> Response:
-    """Get the image of a photograph as it was sent. The whole file is verified first."""
+    """Get the image of a photograph as it was sent. The whole file is verified first.
+
+    Accept: application/octet-stream gets the same bytes as that media type.
+    """
     image = require_image(row := get_row(name, measurement, runtime))
     # Browsers may store it, but must ask again and present the key each time.
     headers = {"ETag": f'"{row.image_sha256}"', "Cache-Control": "private, no-cache"}
@@ -505,7 +528,8 @@ def get_image(
             get_row(name, measurement, runtime)
         )  # it may have been pruned after its row was read
         raise
-    return WholeFile(path, media_type=image.media_type, headers=headers)
+    media_type = OCTETS if request.headers.get("accept") == OCTETS else image.media_type
+    return WholeFile(path, media_type=media_type, headers=headers)
 
 
 @router.get(

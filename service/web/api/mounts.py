@@ -27,7 +27,7 @@ from service.base.fields import (
 )
 from service.store.pointing import mounts
 from service.store.tables import MountRow
-from service.twin.forecasts.heliostat_forecast import position_of
+from service.twin.forecasts.requests import position_of
 from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import CalibrationSlot, make_plan, mount_out
 from service.web.auth.dependencies import (
@@ -180,6 +180,9 @@ class PlannedOut(BaseModel):
     std_mrad: float = Field(
         description="How unsure the spot's place is by what is known now [mrad]."
     )
+    reason: str = Field(
+        description="Why this heliostat; empty where a photograph of one was requested."
+    )
 
 
 def planned_out(slot: CalibrationSlot) -> PlannedOut:
@@ -193,6 +196,7 @@ def planned_out(slot: CalibrationSlot) -> PlannedOut:
         sun=Sun(azimuth_deg=slot.azimuth_deg, elevation_deg=slot.elevation_deg),
         information_bits=proposal.information_bits,
         std_mrad=proposal.std_mrad,
+        reason=slot.reason,
     )
 
 

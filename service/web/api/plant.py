@@ -4,6 +4,7 @@ from typing import Annotated, Literal, Self
 
 from fastapi import APIRouter, Depends, Response, status
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
@@ -24,11 +25,12 @@ from service.sources.documents import (
 from service.sources.plant_schema import CameraEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store import audit
+from service.store.job_tables import JobRow
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
 from service.twin.plant import setup
-from service.twin.plant.model_versions import get_model
+from service.twin.plant.model_versions import declares_camera, get_model
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -68,6 +70,12 @@ class PlantOut(BaseModel):
     )
     tower_size: TowerSize | None = Field(
         description="The tower, which casts a shadow; null: no shadow is known."
+    )
+    camera_choice: dict[str, object] | None = Field(
+        description=(
+            "What images without background are, as job `camera-choices` found, with its evidence."
+            " Job `measurements` with a `camera` declares it. null: it is declared, or not known."
+        )
     )
 
 
@@ -206,20 +214,22 @@ def plant_out(session: Session) -> PlantOut:
         declared=declared,
         sun_shape=describe_sun(get_model(session).optics.sun_shape),
         tower_size=None if row.tower is None else TowerSize(**row.tower),
+        camera_choice=read_camera_choice(session),
     )
+
+
+def read_camera_choice(session: Session) -> dict[str, object] | None:
+    """The newest result of the job `camera-choices`; None if cameras are declared."""
+    query = select(JobRow.result).where(JobRow.kind == "camera-choices", JobRow.state == "done")
+    newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
+    return None if declares_camera(session) else newest
 
 
 def target_out(row: TargetRow) -> TargetOut:
     """A target plane as JSON."""
     located = row.locator or {}
     return from_row(
-        TargetOut,
-        row,
-        center=row.center_m,
-        width=row.width_m,
-        height=row.height_m,
-        marks=located.get("marks"),
-        camera=located.get("camera"),
+        TargetOut, row, **row.geometry, marks=located.get("marks"), camera=located.get("camera")
     )
 
 

@@ -194,11 +194,15 @@ async def require_json(request: Request) -> None:
 
 
 async def require_multipart(request: Request) -> None:
-    """Refuse a body that is not a form with files."""
+    """Refuse a body that is not a form with files, or has a field twice other than ``files``."""
     if _content_type(request) != "multipart/form-data":
         raise UnsupportedContentError(
             "Content-Type: send the file and its fields as multipart/form-data"
         )
+    names = [name for name, _ in (await request.form()).multi_items()]
+    for name in names:
+        if name != "files" and names.count(name) > 1:
+            raise InvalidInputError(f"{name[:60]}: is there twice; send it once")
 
 
 async def accept_archive(_: Annotated[None, Depends(require_multipart)]) -> None:

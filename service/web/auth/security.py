@@ -64,10 +64,14 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class Identity:
-    """The sender of a request: the name and the role of its key."""
+    """The sender of a request: the name and the role of its key.
+
+    ``unrecorded`` is the id of a key of which a use is to be recorded.
+    """
 
     name: str
     role: Role
+    unrecorded: int | None = None
 
 
 LOCAL = Identity(keys.RESERVED, Role.ADMIN)
@@ -136,7 +140,9 @@ def identify(
     with database.reading() as session:
         if presented is not None:
             row = keys.find(session, presented) or sessions.find_key(session, presented)
-            return None if row is None else Identity(row.name, Role(row.role))
+            if row is None:
+                return None
+            return Identity(row.name, Role(row.role), row.id if keys.is_use_due(row) else None)
         if is_direct and may_be_open(settings) and not keys.any_made(session):
             return LOCAL
     return None

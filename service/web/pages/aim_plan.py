@@ -40,8 +40,8 @@ _TOLERANCE = 0.005
 class AimView:
     """What the page shows of one step: its figures, its maps, and all steps of a day.
 
-    ``maps`` are on one scale: the limit with the aims, a single aim, and the plan. ``timelines``
-    are those of a day.
+    ``maps`` are on one scale: the aims, a single aim, and the plan. ``timelines`` are those of a
+    day.
     """
 
     figures: Mapping[str, Any]
@@ -91,7 +91,7 @@ def _timelines(steps: list[Mapping[str, Any]], zone: str, limit_w_m2: Any) -> li
         }
 
     power = {"plan": "power_w", "most that any aims can give": "bound_w"}
-    peak = {"peak in 95 % of draws": "peak_p95_w_m2", "expected peak": "peak_w_m2"}
+    peak = {"peak in 95 % of cases": "peak_p95_w_m2", "expected peak": "peak_w_m2"}
     drawn = (
         timeline("Power on the receiver", "kW", series(power), 1, axis=axis),
         timeline("Largest flux", "kW/m²", series(peak), 1, axis=axis, limit=limit),
@@ -109,14 +109,17 @@ def _maps(arrays: dict[str, NDArray[Any]], size: tuple[float, float]) -> dict[st
     limit = arrays["limit"]
     fluxes = {"single": arrays["single_aim_flux"], "plan": arrays["flux"]}
     # The flux sets the scale: a limit that is nowhere reached must not make it dark.
-    top = max(float(limit.min()), *(float(flux.max()) for flux in fluxes.values())) / 1e3
+    top = max(float(limit.min()), *(float(flux.max()) for flux in fluxes.values()))
     titles = {"single": "Flux if all aim at one point", "plan": "Flux by the plan"}
-    maps = {"limit": charts.limit_map("Limit of flux, and the aims", limit / 1e3, size, top)}
+    maps = {
+        name: charts.outlined(charts.irradiance_map(titles[name], flux, size, top), flux > limit)
+        for name, flux in fluxes.items()
+    }
+    is_even = bool(limit.min() == limit.max())  # its map would be one colour
+    title = f"Aims as dots over the {'flux of the plan' if is_even else 'limit'}"
+    maps["aims"] = charts.irradiance_map(title, fluxes["plan"] if is_even else limit, size, top)
     if "places" in arrays:
-        maps["limit"] = charts.dotted(maps["limit"], arrays["places"][arrays["active"]])
-    for name, flux in fluxes.items():
-        drawn = charts.limit_map(titles[name], flux / 1e3, size, top)
-        maps[name] = charts.marked(drawn, flux > limit)
+        maps["aims"] = charts.dotted(maps["aims"], arrays["places"][arrays["active"]])
     return maps
 
 

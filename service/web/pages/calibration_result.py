@@ -14,7 +14,7 @@ from service.store.tables import HeliostatRow, MountRow
 from service.twin.pointing.calibration import UndatedCount
 
 MOST = 100
-"""Most mounts, steps and photographs that the page lists."""
+"""Most mounts, steps and photographs on a page."""
 
 OFFSETS = {
     "first_zero": "First drive's zero [mrad]",
@@ -41,6 +41,12 @@ class CalibrationView:
     clock: str | None
     undated: str | None
 
+    @property
+    def longest(self) -> int:
+        """Length of the longest list."""
+        lists = self.versions, self.steps, self.outliers, *self.skipped.values()
+        return max(map(len, lists))
+
 
 def _step(step: Mapping[str, Any]) -> Mapping[str, object]:
     ends = {end: datetime.fromisoformat(step[end]) for end in ("from", "to")}
@@ -48,13 +54,15 @@ def _step(step: Mapping[str, Any]) -> Mapping[str, object]:
 
 
 def calibration_view(
-    session: Session, job: JobRow, result: Mapping[str, Any]
+    session: Session, job: JobRow, result: Mapping[str, Any], begin: int
 ) -> CalibrationView | None:
-    """The view of a finished calibration; None for other jobs."""
+    """The view of a finished calibration, with mounts from the index ``begin``; None for other
+    jobs.
+    """
     if job.kind != "calibrations" or "mounts" not in result:
         return None
     versions: Mapping[str, int] = result["mounts"]
-    names = sorted(versions)[:MOST]
+    names = sorted(versions)[begin : begin + MOST]
     rows = session.execute(
         select(HeliostatRow.name, MountRow)
         .join(MountRow, MountRow.heliostat_id == HeliostatRow.id)

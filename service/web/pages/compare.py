@@ -6,6 +6,7 @@ Maps share one scale. The page also shows the forecasts of both surfaces, and th
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from statistics import fmean
 from typing import Annotated
 
@@ -38,16 +39,18 @@ from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline, Value
 from service.store.columns import EPOCH
-from service.store.listing import Period
+from service.store.listing import EVER, Period
 from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
 from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.forecasts.heliostat_forecast import ForecastRequest, trace_request
+from service.twin.forecasts.heliostat_forecast import trace_request
+from service.twin.forecasts.requests import ForecastIn
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.operations import Forecast
 from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.accuracy import RECENT, ComparisonResult
+from service.twin.surfaces.accuracy import RECENT, ComparisonResult, is_misleading
+from service.twin.surfaces.epochs import epoch_of
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     READ,
@@ -218,16 +221,14 @@ class Forecasts:
     agreement: float
 
 
-def _forecasts(
-    runtime: Runtime, sides: tuple[Side, Side], target: str, sun: tuple[float, float]
-) -> Forecasts:
+def _forecasts(runtime: Runtime, sides: tuple[Side, Side], target: str, sun: Sun) -> Forecasts:
     """Trace both surfaces; ModelError if the light does not reach the target."""
     traced = [
         trace_request(
             runtime,
-            ForecastRequest(
-                side.heliostat.name,
-                Sun(azimuth_deg=sun[0], elevation_deg=sun[1]),
+            ForecastIn(
+                heliostat=side.heliostat.name,
+                sun=sun,
                 target=target,
                 surface=side.surface.version,
                 resolution=_RESOLUTION,
@@ -257,16 +258,7 @@ def _forecasts(
 
 def _within(values: Sequence[Value], span: Period) -> list[Value]:
     """Values of a period; those without a time are of no period."""
-    return [
-        one
-        for one in values
-        if span == Period()
-        or (
-            one.at is not None
-            and (span.since is None or one.at >= span.since)
-            and (span.until is None or one.at < span.until)
-        )
-    ]
+    return [one for one in values if span.contains(one.at)]
 
 
 def _timelines(
@@ -317,22 +309,27 @@ def _timelines(
     return draw_on_one_axis(within, data.zone, marks)
 
 
-def _unseen(compared: Sequence[ComparisonResult]) -> tuple[list[float], int]:
+def _unseen(
+    compared: Sequence[ComparisonResult], epochs: Sequence[Period]
+) -> tuple[list[float], int]:
     """Mean accuracies [1] on photographs that neither surface was made from, and their number.
 
-    They are the `RECENT` newest, as when a new surface is judged.
+    They are the `RECENT` newest of some epochs, as when a new surface is judged.
     """
-    found = [{c.measurement.id: c for c in one.comparisons} for one in compared]
+    found = [
+        {c.measurement.id: c for c in one.comparisons if epoch.contains(c.measurement.taken_at)}
+        for one, epoch in zip(compared, epochs, strict=True)
+    ]
+    rows = {number: c.measurement for one in found for number, c in one.items()}
     either = found[0].keys() & found[1].keys() or found[0].keys() | found[1].keys()
     fair = {
         number
         for number in either
         if not any(one[number].was_used for one in found if number in one)
     }
-    taken = {number: c.measurement.taken_at for one in found for number, c in one.items()}
-    newest = sorted(fair, key=lambda number: (taken[number] or EPOCH, number), reverse=True)[
-        :RECENT
-    ]
+    clear = {number for number in fair if not is_misleading(rows[number])} or fair
+    order = sorted(clear, key=lambda number: (rows[number].taken_at or EPOCH, number))
+    newest = order[::-1][:RECENT]
     means = [[one[number].accuracy for number in newest if number in one] for one in found]
     return [fmean(some) for some in means if some], len(newest)
 
@@ -349,10 +346,11 @@ class _ComparisonData:
     """
 
     sides: tuple[Side, Side] | None
+    epochs: Sequence[Period]
     alone: str | None
     compared: Sequence[ComparisonResult | None]
     targets: Sequence[str]
-    sun: tuple[float, float]
+    sun: Sun
     zone: str
 
 
@@ -361,7 +359,7 @@ def _read(
 ) -> _ComparisonData:
     with runtime.database.reading() as session:
         targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
-        azimuth, elevation = sun_now(session.get(PlantRow, 1))
+        sun = sun_now(session.get(PlantRow, 1))
         zone = plant_time_zone(session, runtime.settings.time_zone)
         sides, alone = None, None
         if query.heliostat is not None:
@@ -375,11 +373,17 @@ def _read(
         if sides is not None:
             _require_as_many_facets(*sides)
         span = query.span(zone)
+        epochs = [span] * len(sides or ())
+        if sides is not None and span == EVER:
+            by_version = sorted((side.surface for side in sides), key=attrgetter("version"))
+            newest = {surface.heliostat_id: surface for surface in by_version}
+            rows = [side.heliostat for side in sides]
+            epochs = [epoch_of(session, row, newest[row.id]) for row in rows]
         shown = [cache.read(session, side.heliostat, side.surface, span) for side in sides or ()]
     compared = [ComparisonResult() if one is None else cache.wait_for(one) for one in shown]
-    given = query.azimuth_deg, query.elevation_deg
-    sun = (azimuth if given[0] is None else given[0], elevation if given[1] is None else given[1])
-    return _ComparisonData(sides, alone, compared, targets, sun, zone)
+    given = {"azimuth_deg": query.azimuth_deg, "elevation_deg": query.elevation_deg}
+    sun = sun.model_copy(update={name: angle for name, angle in given.items() if angle is not None})
+    return _ComparisonData(sides, epochs, alone, compared, targets, sun, zone)
 
 
 @router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
@@ -409,7 +413,7 @@ def get_compare_page(
         change_mm=1e3 * float(np.sqrt(np.mean((read.sides[1].z - read.sides[0].z) ** 2))),
         forecasts=forecasts,
         trouble=trouble,
-        unseen=_unseen(known) if is_whole else None,
+        unseen=_unseen(known, read.epochs) if is_whole else None,
         timelines=_timelines(read, read.sides, query.span(read.zone), runtime.settings),
         again=None if is_whole else str(request.url.query),
     )

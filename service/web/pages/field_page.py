@@ -15,8 +15,7 @@ from pydantic import Field
 
 from service import store
 from service.base.fields import Search
-from service.base.settings import Settings
-from service.drawing.charts import CONDITION, Scale
+from service.drawing.charts import CONDITION, ColourScale
 from service.drawing.pictures import places_picture
 from service.drawing.templates import in_zone
 from service.store.tables import PlantRow
@@ -107,7 +106,7 @@ class FieldMap:
 
     lines: Sequence[HeliostatOverview]
     metric: Metric
-    scale: Scale
+    scale: ColourScale
 
     @property
     def title(self) -> str:
@@ -164,12 +163,36 @@ def legend(fine: float, poor: float) -> list[LegendStep]:
     return [LegendStep(step, low + place * width) for place, step in enumerate(order)]
 
 
-def scale_for(metric: Metric, settings: Settings) -> Scale:
-    """Colours of a metric's picture, from blue (fine) to red (poor), the same for every field."""
-    fine, poor = settings.map_scales[metric.name]
+@dataclass(frozen=True)
+class ColourEnds:
+    """The values of a metric at the ends of its colours, the best first."""
+
+    best: float
+    worst: float
+
+
+def colour_ends(
+    lines: Sequence[HeliostatOverview], metric: Metric, limits: ColourEnds
+) -> ColourEnds:
+    """The values that the colours of a field span.
+
+    They begin at its best value, at ``limits.best`` if all are worse. They end at its worst, at
+    most at ``limits.worst``, and never within half the distance of the limits.
+    """
+    sign = 1 if limits.worst > limits.best else -1
+    values = [sign * value for line in lines if (value := metric.shown(line)) is not None]
+    fine, poor = sign * limits.best, sign * limits.worst
+    best = min([fine, *values])
+    worst = min(poor, max([best + (poor - fine) / 2, *values]))
+    return ColourEnds(sign * best, sign * worst)
+
+
+def scale_for(metric: Metric, ends: ColourEnds) -> ColourScale:
+    """Colours of a metric's picture, from blue (the best) to red (the worst)."""
+    best, worst = ends.best, ends.worst
     label = f"{metric.label} [{metric.unit}]"
-    colours = CONDITION if poor < fine else f"{CONDITION}_r"
-    return Scale(colours, min(fine, poor), max(fine, poor), label)
+    colours = CONDITION if worst < best else f"{CONDITION}_r"
+    return ColourScale(colours, min(best, worst), max(best, worst), label)
 
 
 _WIDTH = 720.0
@@ -192,13 +215,13 @@ def _marks(
     lines: Sequence[HeliostatOverview],
     places: dict[str, tuple[float, float]],
     metric: Metric,
-    ends: tuple[float, float],
+    ends: ColourEnds,
     side: float,
 ) -> list[Marks]:
     values = [metric.shown(line) for line in lines]
     known = [(line, value) for line, value in zip(lines, values, strict=True) if value is not None]
-    fine, poor = ends
-    shares = (np.array([value for _, value in known]) - fine) / (poor - fine)
+    span = ends.worst - ends.best
+    shares = (np.array([value for _, value in known]) - ends.best) / span
     steps = np.clip(shares * STEPS, 0, STEPS - 1).astype(int).tolist()
     groups: dict[int, list[tuple[HeliostatOverview, float]]] = {}
     for entry, step in zip(known, steps, strict=True):
@@ -230,12 +253,11 @@ def draw(
     lines: Sequence[HeliostatOverview],
     chosen: Sequence[HeliostatOverview],
     metric: Metric,
-    ends: tuple[float, float],
+    ends: ColourEnds,
 ) -> Drawing:
     """Draw the map of ``lines``, with the ``chosen`` ones emphasized.
 
-    ``ends`` are the values that are fine and poor, where the colours end. The tower, at the
-    origin, is always on the map.
+    The colours end at ``ends``. The tower, at the origin, is always on the map.
     """
     east = np.array([line.east_m for line in lines] + [0.0])
     north = np.array([line.north_m for line in lines] + [0.0])
@@ -307,11 +329,12 @@ def get_field(
         )
         zone = plant_time_zone(session, runtime.settings.time_zone)
     lines, chosen = now.lines, METRICS[view.metric]
-    limit, ends = runtime.settings.alarm_accuracy, runtime.settings.map_scales[view.metric]
+    limit, limits = runtime.settings.alarm_accuracy, runtime.settings.map_scales[view.metric]
+    ends = colour_ends(lines, chosen, ColourEnds(*limits))
     found = filter_heliostats(lines, view)
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED
-    scale = scale_for(chosen, runtime.settings)
+    scale = scale_for(chosen, ends)
     return render(
         request,
         "field.html",
@@ -335,9 +358,10 @@ def get_field(
         metrics=METRICS,
         metric=chosen,
         scale=scale,
-        fine=ends[0],
-        poor=ends[1],
-        steps=legend(*ends),
+        fine=limits[0],
+        poor=limits[1],
+        ends=ends,
+        steps=legend(ends.best, ends.worst),
         field_map=FieldMap(found, chosen, scale),
         drawing=draw(lines, found, chosen, ends) if lines else None,
         pending=now.pending,

@@ -1,9 +1,8 @@
 """Pages of forecasts: a form, and the resulting flux map."""
 
 import re
-from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 from zoneinfo import ZoneInfo
 
 from fastapi import APIRouter, Form, Path, Query, Request, Response
@@ -15,12 +14,14 @@ from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
 from model.errors import InvalidInputError
+from model.frames import solar_time, sun_direction
 from service import store
 from service.base.errors import NotFoundError
 from service.base.fields import (
     AZIMUTH,
     ELEVATION,
     FormMoment,
+    JsonObject,
     Lines,
     Model,
     Name,
@@ -32,7 +33,7 @@ from service.base.fields import (
 )
 from service.base.names import NAME
 from service.drawing import charts
-from service.drawing.templates import times_in_zone
+from service.drawing.templates import irradiance, times_in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
@@ -40,15 +41,13 @@ from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.twin.alarms.measured_states import read_requested_states
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.forecasts.heliostat_forecast import (
-    ForecastRequest,
-    flux_of,
-    make_forecast,
-    position_of,
-)
-from service.twin.forecasts.watts import dni_of, loss_chain
+from service.twin.forecasts.heliostat_forecast import flux_of, make_forecast, size_of
+from service.twin.forecasts.requests import ForecastIn, position_of
+from service.twin.forecasts.watts import Sunlight, loss_chain
 from service.twin.runtime.runtime import Runtime
+from service.web.api.forecasts import forecast_summary
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -68,20 +67,24 @@ _RECENT = 10
 _OFFERED = 20
 
 
-@dataclass(frozen=True)
-class Made:
-    """A line in the list of forecasts: its path and its main values."""
+class SunlightForm(Model):
+    """A form with the sunlight: an irradiance [W/m2], or that of a clear sky."""
 
-    path: str
-    name: str
-    of: str
-    target: str | None
-    sun_deg: tuple[float | None, float | None]
-    peak_w_m2: float
-    created_at: datetime
+    sunlight: Literal["given", "clear_sky"] = "given"
+    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
+
+    @property
+    def given_dni(self) -> Sunlight:
+        """The irradiance [W/m2], or that it is that of a clear sky."""
+        return "clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2
 
 
-class ForecastForm(Model):
+def sunlight_fields(dni: Sunlight) -> dict[str, object]:
+    """Fields of `SunlightForm` for a requested irradiance."""
+    return {"sunlight": dni} if dni == "clear_sky" else {"dni_w_m2": dni}
+
+
+class ForecastForm(SunlightForm):
     """The form. ``heliostat`` has one name or several, apart by commas or blanks.
 
     Without a name, it requests a forecast of all heliostats.
@@ -94,8 +97,21 @@ class ForecastForm(Model):
     elevation_deg: Annotated[float, ELEVATION] | None = None
     moment: FormMoment | None = None
     surface: Literal["current", "ideal"] = "current"
-    sunlight: Literal["given", "clear_sky"] = "given"
-    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
+
+    @classmethod
+    def filled(
+        cls, heliostats: str, target: str | None, sun: Sun, at: datetime | None, **more: Any
+    ) -> "ForecastForm":
+        """The form with a sun, by its time ``at`` if it is known; it is not validated."""
+        return cls.model_construct(
+            heliostat=heliostats,
+            target=target or "",
+            sun_by="position" if at is None else "time",
+            azimuth_deg=round(sun.azimuth_deg, 2) % 360,
+            elevation_deg=round(sun.elevation_deg, 2),
+            moment=at,
+            **more,
+        )
 
     @model_validator(mode="after")
     def _says_when_or_where(self) -> Self:
@@ -122,9 +138,14 @@ class ForecastForm(Model):
         return list(dict.fromkeys(self.heliostat.replace(",", " ").split()))
 
     @property
-    def given_dni(self) -> float | Literal["clear_sky"]:
-        """The irradiance [W/m2], or that it is that of a clear sky."""
-        return "clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2
+    def asked(self) -> JsonObject:
+        """Fields that requests for one heliostat and for many share."""
+        return {
+            "target": self.target,
+            "sun": self.sun,
+            "surface": self.surface,
+            "dni_w_m2": self.given_dni,
+        }
 
     @property
     def sun(self) -> Sun | SunAt:
@@ -139,25 +160,32 @@ class ForecastForm(Model):
 
 When = Literal["now", "noon"]
 
-WHENS: dict[When, str] = {"now": "Now", "noon": "Noon tomorrow"}
+WHENS: dict[When, str] = {"now": "Now", "noon": "Solar noon tomorrow"}
 """Times that forms offer, with their labels."""
 
 
-def time_of(when: When, zone: str) -> datetime:
-    """Now, or noon of the next day in a time ``zone``; without seconds, in UTC."""
+def time_of(when: When, zone: str, plant: PlantRow | None) -> datetime:
+    """Now, or the sun's noon of the next day in a time ``zone``; without seconds, in UTC.
+
+    Without a plant it is noon by the clock.
+    """
     at = now().replace(second=0, microsecond=0)
     if when == "now":
         return at
     tomorrow = at.astimezone(ZoneInfo(zone)).replace(tzinfo=None) + timedelta(days=1)
-    return plant_time_to_utc(tomorrow.replace(hour=12, minute=0), zone)
-
-
-def sun_now(plant: PlantRow | None) -> tuple[float, float]:
-    """Azimuth and elevation of the sun now [deg]. At night or without a plant: 180 and 45."""
+    noon = plant_time_to_utc(tomorrow.replace(hour=12, minute=0), zone)
     if plant is None:
-        return 180.0, 45.0
-    azimuth, elevation = sun_angles_at(now(), plant.origin)
-    return (round(azimuth, 2) % 360, round(elevation, 2)) if elevation > 5 else (180.0, 45.0)
+        return noon
+    hours = float(solar_time(sun_direction(*sun_angles_at(noon, plant.origin)), plant.origin[0]))
+    return (noon + timedelta(hours=12.0 - hours)).replace(second=0, microsecond=0)
+
+
+def sun_now(plant: PlantRow | None) -> Sun:
+    """The sun now. At night or without a plant its azimuth is 180 and its elevation 45."""
+    azimuth, elevation = (0.0, 0.0) if plant is None else sun_angles_at(now(), plant.origin)
+    if elevation <= 5:
+        azimuth, elevation = 180.0, 45.0
+    return Sun(azimuth_deg=round(azimuth, 2) % 360, elevation_deg=round(elevation, 2))
 
 
 def _choices(session: Session) -> dict[str, object]:
@@ -167,37 +195,8 @@ def _choices(session: Session) -> dict[str, object]:
         "receivers": session.execute(
             select(ReceiverRow.name, ReceiverRow.kind).order_by(ReceiverRow.name)
         ).all(),
-        "recent": _recent(session),
+        "recent": store.recent_forecasts(session, _RECENT),
     }
-
-
-def _recent(session: Session) -> list[Made]:
-    """The newest forecasts of one heliostat and of many, newest first."""
-    of_one = [
-        Made(
-            f"/forecasts/{row.id}",
-            str(row.id),
-            row.heliostat.name,
-            row.target_name,
-            (row.sun_azimuth_deg, row.sun_elevation_deg),
-            row.peak_w_m2,
-            row.created_at,
-        )
-        for row in store.recent_forecasts(session, _RECENT)
-    ]
-    of_many = [
-        Made(
-            f"/jobs/{row.job}",
-            f"job {row.job}",
-            f"{row.heliostats} together",
-            row.target,
-            (row.sun_azimuth_deg, row.sun_elevation_deg),
-            row.peak_w_m2,
-            row.created_at,
-        )
-        for row in store.recent_field_forecasts(session, _RECENT)
-    ]
-    return sorted([*of_one, *of_many], key=lambda made: made.created_at, reverse=True)[:_RECENT]
 
 
 @router.get("/forecast/heliostats", dependencies=[READ])
@@ -229,17 +228,12 @@ def get_forecast_form(
         if job is not None:
             filled = _filled_as(session, queue.get_job(session, job))
             return _page(request, runtime, choices, filled, forecast=None)
-        azimuth, elevation = sun_now(session.get(PlantRow, 1))
+        plant = session.get(PlantRow, 1)
+        sun = sun_now(plant)
         zone = plant_time_zone(session, runtime.settings.time_zone)
+        moment = None if when is None else time_of(when, zone, plant)
         name = heliostat or next((row.name for row in store.list_heliostats(session, 1)), "")
-    filled = ForecastForm.model_construct(
-        heliostat=name,
-        target=target or "",
-        azimuth_deg=azimuth,
-        elevation_deg=elevation,
-        sun_by="position" if when is None else "time",
-        moment=None if when is None else time_of(when, zone),
-    )
+    filled = ForecastForm.filled(name, target, sun, moment)
     return _page(request, runtime, choices, filled, forecast=None)
 
 
@@ -249,17 +243,13 @@ def _filled_as(session: Session, job: JobRow) -> ForecastForm:
         raise NotFoundError(f"job {job.id} is no forecast")
     asked = FleetForecastIn.model_validate(job.payload)
     moment = asked.sun.at if isinstance(asked.sun, SunAt) else None
-    sun = position_of(session, asked.sun)
-    return ForecastForm.model_construct(
-        heliostat=", ".join(asked.heliostats or ()),
-        target=asked.target or "",
-        azimuth_deg=round(sun.azimuth_deg, 2) % 360,
-        elevation_deg=round(sun.elevation_deg, 2),
+    return ForecastForm.filled(
+        ", ".join(asked.heliostats or ()),
+        asked.target,
+        position_of(session, asked.sun),
+        moment,
         surface=asked.surface,
-        sunlight="clear_sky" if asked.dni_w_m2 == "clear_sky" else "given",
-        dni_w_m2=1000.0 if asked.dni_w_m2 == "clear_sky" else asked.dni_w_m2,
-        sun_by="position" if moment is None else "time",
-        moment=moment,
+        **sunlight_fields(asked.dni_w_m2),
     )
 
 
@@ -279,16 +269,10 @@ def _ask_for_many(runtime: Runtime, form: ForecastForm, identity: Identity) -> s
     It takes longer than a request may.
     """
     try:
-        payload = FleetForecastIn(
-            heliostats=form.names or None,
-            target=form.target,
-            sun=form.sun,
-            surface=form.surface,
-            dni_w_m2=form.given_dni,
-        )
+        payload = FleetForecastIn(heliostats=form.names or None, **form.asked)
     except ValidationError as error:
         raise RequestValidationError(error.errors()) from error
-    row = enqueue(runtime, field_forecasts.KIND, payload, identity.name)
+    row = enqueue(runtime, field_forecasts.KIND, payload, identity.name).row
     return f"/jobs/{row.id}"
 
 
@@ -303,23 +287,16 @@ def post_forecast_form(
     with runtime.database.reading() as session:
         zone = plant_time_zone(session, runtime.settings.time_zone)
         form = form.in_utc(zone)
-        altitude = store.get_plant(session).altitude_m
         try:
-            sun = position_of(session, form.sun)
+            position_of(session, form.sun)
         except InvalidInputError as night:
             said = times_in_zone(str(night), zone).removeprefix("at: ")
             raise InvalidInputError(f"moment: {said}") from night
     if len(form.names) != 1:
         return leave_for(request, _ask_for_many(runtime, form, identity))
-    asked = ForecastRequest(
-        heliostat=form.names[0],
-        target=form.target,
-        sun=sun,
-        sun_at=form.moment if form.sun_by == "time" else None,
-        surface=form.surface,
-        dni_w_m2=dni_of(form.given_dni, sun.elevation_deg, altitude),
-    )
-    return go_to(f"/forecasts/{make_forecast(runtime, asked).id}")
+    asked = ForecastIn(heliostat=form.names[0], **form.asked)
+    row = make_forecast(runtime, asked, read_requested_states(runtime, asked))
+    return go_to(f"/forecasts/{row.id}")
 
 
 @router.get("/forecasts/{number}", dependencies=[READ, RENDER_SLOT])
@@ -332,25 +309,18 @@ def get_forecast_page(
     with runtime.database.reading() as session:
         row = store.get_forecast(session, number)
         choices = _choices(session)
-    size = (row.window_m or row.plane["width"], row.window_m or row.plane["height"])
+    made, size = forecast_summary(row), size_of(row)
     title = (
-        f"Flux of {row.heliostat.name} on {row.target_name or 'a plane'},"
-        f" peak {row.peak_w_m2 / 1e3:.2f} kW/m²"
+        f"Flux of {made.heliostat} on {made.target or 'a plane'}, peak {irradiance(made.peak_w_m2)}"
     )
-    filled = ForecastForm.model_construct(
-        heliostat=row.heliostat.name,
-        target=row.target_name or "",
-        sun_by="position" if row.sun_at is None else "time",
-        azimuth_deg=round(row.sun_azimuth_deg, 2) % 360,
-        elevation_deg=round(row.sun_elevation_deg, 2),
-        moment=row.sun_at,
-        surface="ideal" if row.surface is None else "current",
-        dni_w_m2=row.dni_w_m2,
+    surface = "ideal" if row.surface is None else "current"
+    filled = ForecastForm.filled(
+        made.heliostat, made.target, made.sun, made.at, surface=surface, dni_w_m2=made.dni_w_m2
     )
     flux = (
         charts.flux_map(title, flux_of(row), size, "% per pixel")
-        if row.normalised
+        if made.normalised
         else charts.irradiance_map(title, flux_of(row), size)
     )
-    chain = loss_chain(row.losses)
-    return _page(request, runtime, choices, filled, forecast=row, flux=flux, chain=chain)
+    more = {"stored": row.document, "chain": loss_chain(row.document["losses"])}
+    return _page(request, runtime, choices, filled, forecast=made, flux=flux, **more)

@@ -22,7 +22,7 @@ from service.base.arrays import unpack
 from service.base.fields import Version
 from service.base.settings import Settings
 from service.drawing import charts
-from service.drawing.charts import HeatMap, History, Scale
+from service.drawing.charts import ColourScale, HeatMap, History
 from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Timeline
@@ -48,7 +48,7 @@ from service.twin.alarms.field_overview import (
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.facets import facet_places
 from service.twin.pointing.calibration import CalibrationSlot, best_slot
-from service.twin.surfaces.accuracy import Comparison, ComparisonResult, rank_of
+from service.twin.surfaces.accuracy import ComparisonResult, PhotographComparison, rank_of
 from service.web.auth.dependencies import (
     READ,
     ComparisonCacheDep,
@@ -65,9 +65,9 @@ from service.web.pages.heliostat_charts import (
     version_marks,
 )
 from service.web.pages.heliostat_decision import (
-    Choice,
     Exclusion,
     OutlierEvidence,
+    SurfaceChoice,
     find_choice,
     newest_exclusions,
     outlier_evidence,
@@ -107,7 +107,7 @@ class ComparisonFigure:
 
     formats: ClassVar[tuple[str, ...]] = ("npz", "png")
 
-    comparison: Comparison
+    comparison: PhotographComparison
     measured: HeatMap
     forecast: HeatMap
     difference: HeatMap
@@ -194,7 +194,7 @@ def space_view(z: NDArray[Any], places: FacetPlaces, bound: float) -> str:
         facets.append(dict(zip(("center", "x", "y"), vectors, strict=True)) | {"heights": known})
     size = np.round(places.box[1] - low, 5).tolist()
     middle = np.round(places.box.mean(axis=0), 5).tolist()
-    colours = Scale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
+    colours = ColourScale("RdBu_r", 0, 1, "").names(np.linspace(0, 1, 33).tolist())
     return json.dumps(
         {"size": size, "middle": middle, "bound": bound, "facets": facets, "colours": colours}
     )
@@ -208,12 +208,14 @@ class ComparisonFigures:
     """
 
     figures: list[ComparisonFigure]
-    flux: Scale
-    difference: Scale
+    flux: ColourScale
+    difference: ColourScale
     beyond: float | None
 
 
-def comparison_figures(comparisons: Sequence[Comparison], bound: float) -> ComparisonFigures:
+def comparison_figures(
+    comparisons: Sequence[PhotographComparison], bound: float
+) -> ComparisonFigures:
     """Maps in shares of each photograph's measured peak, as in study reports.
 
     ``bound`` is the end of the scale of differences [1].
@@ -267,7 +269,7 @@ def _surface_context(
 
 
 def _choice_maps(
-    read: "_HeliostatData", choice: Choice, ends: Mapping[str, float]
+    read: "_HeliostatData", choice: SurfaceChoice, ends: Mapping[str, float]
 ) -> list[HeatMap]:
     """The active surface, the candidate, and their difference."""
     n_facets = len(unpack(choice.candidate.arrays)["z"])
@@ -318,7 +320,7 @@ class _HeliostatData:
     causes: list[causes.LikelyCause]
     evidence: OutlierEvidence | None
     exclusions: list[Exclusion]
-    choice: Choice | None
+    choice: SurfaceChoice | None
     acknowledgement: AcknowledgementOut | None
 
 

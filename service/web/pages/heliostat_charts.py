@@ -9,7 +9,7 @@ import numpy as np
 from service.base.settings import Settings
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.store.tables import MountRow, SurfaceRow
-from service.twin.surfaces.accuracy import Comparison
+from service.twin.surfaces.accuracy import PhotographComparison
 from service.twin.surfaces.accuracy import photograph_name as photograph_of
 
 
@@ -24,7 +24,7 @@ class OverTime:
     limit: Threshold | None = None
 
 
-def accuracy_values(comparisons: Sequence[Comparison]) -> list[Value]:
+def accuracy_values(comparisons: Sequence[PhotographComparison]) -> list[Value]:
     """Accuracies of the forecasts [%] at the times of the photographs."""
     return [
         Value(row.taken_at, 100 * one.accuracy, photograph_of(row), one.was_used)

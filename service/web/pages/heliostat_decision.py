@@ -12,6 +12,7 @@ from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.store.photographs.correction_log import list_corrections
 from service.store.photographs.groups import PhotographFilter, list_groups
+from service.store.surfaces.decisions import Justification, find_comparison
 from service.store.tables import CorrectionRow, DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms.causes import HeliostatFacts, outlier_reasons
 
@@ -49,15 +50,15 @@ def outlier_evidence(facts: HeliostatFacts) -> OutlierEvidence:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class SurfaceChoice:
     """A candidate and the active surface, which is None for the ideal mirror.
 
-    ``evaluation`` is the newest decision on the candidate: when it was predicted, by a computer.
+    ``evaluation`` is the last comparison of the two.
     """
 
     candidate: SurfaceRow
     active: SurfaceRow | None
-    evaluation: DecisionRow | None
+    evaluation: Justification | None
 
     def maps(self, places: FacetPlaces, ends: Mapping[str, float]) -> list[HeatMap]:
         """Both surfaces on one scale, and the candidate minus the active one if it fits."""
@@ -77,7 +78,7 @@ class Choice:
 
 def find_choice(
     session: Session, surfaces: Sequence[SurfaceRow], active: SurfaceRow | None, version: int | None
-) -> Choice | None:
+) -> SurfaceChoice | None:
     """The candidate of this ``version``, else the newest one on which nobody has decided.
 
     ``surfaces`` are a heliostat's newest ones, with their arrays, newest first. A candidate that is
@@ -90,5 +91,5 @@ def find_choice(
         found = session.scalars(query.order_by(DecisionRow.id.desc()).limit(2)).all()
         is_new = len(found) < 2 and (active is None or row.version > active.version)
         if version is not None or is_new:
-            return Choice(row, active, found[-1] if found else None)
+            return SurfaceChoice(row, active, find_comparison(session, row, active))
     return None

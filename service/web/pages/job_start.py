@@ -8,9 +8,8 @@ from fastapi.responses import HTMLResponse
 from pydantic import model_validator
 
 from service import store
-from service.base.fields import FormMoment, Method, Model, Moment, Name, Text, drop_empty_fields
+from service.base.fields import FormMoment, Method, Model, Name, Text, drop_empty_fields
 from service.jobs.costs import calibration_cost, count_images, import_cost, prediction_cost
-from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import calibrations, imports, predictions
 from service.jobs.kinds.calibrations import CalibrationIn
 from service.jobs.kinds.imports import ImportIn, allowed_folder, import_root
@@ -25,7 +24,7 @@ from service.web.auth.dependencies import (
     RuntimeDep,
     accept_archive,
 )
-from service.web.responses.pages import go_to, render
+from service.web.responses.pages import go_to, go_to_job, render
 
 router = APIRouter(include_in_schema=False, prefix="/jobs")
 
@@ -35,14 +34,13 @@ _MOST_FOLDERS = 200
 class StartQuery(Model):
     """What the page computes costs of: one ``heliostat`` or all, a method, and a folder.
 
-    Predictions take photographs since ``since``. The folder may be an ``uploaded`` one.
+    The folder may be an ``uploaded`` one.
     """
 
     heliostat: Name | None = None
     method: Method = "refined"
     folder: Text | None = None
     uploaded: bool = False
-    since: Moment | None = None
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
@@ -104,8 +102,8 @@ def post_predictions_form(
     form: Annotated[StartQuery, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Enqueue predictions, and go to the page of the job."""
-    payload = PredictionsIn(heliostats=form.heliostats, method=form.method, since=form.since)
-    return go_to(f"/jobs/{enqueue(runtime, predictions.KIND, payload, identity.name).id}")
+    payload = PredictionsIn(heliostats=form.heliostats, method=form.method)
+    return go_to_job(runtime, predictions.KIND, payload, identity)
 
 
 @router.post("/calibrations", dependencies=[OPERATE])
@@ -117,7 +115,7 @@ def post_calibrations_form(
         form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
     names = None if form.heliostat is None else [form.heliostat]
     payload = CalibrationIn(heliostats=names, since=form.since, until=form.until)
-    return go_to(f"/jobs/{enqueue(runtime, calibrations.KIND, payload, identity.name).id}")
+    return go_to_job(runtime, calibrations.KIND, payload, identity)
 
 
 @router.post("/imports", dependencies=[OPERATE])
@@ -127,7 +125,7 @@ def post_imports_form(
     """Enqueue the import of a folder, and go to the page of the job. An upload has one job."""
     if not form.uploaded:
         allowed_folder(import_root(runtime.settings), form.folder)
-    return go_to(f"/jobs/{enqueue(runtime, imports.KIND, form, identity.name).id}")
+    return go_to_job(runtime, imports.KIND, form, identity)
 
 
 @router.post("/imports/upload", dependencies=[OPERATE, Depends(accept_archive), COMPUTE_SLOT])

@@ -1,5 +1,6 @@
 """Pages of jobs: what runs, what has ended, and buttons that cancel jobs."""
 
+import math
 from collections.abc import Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal
@@ -31,7 +32,7 @@ from service.web.auth.dependencies import (
     RuntimeDep,
 )
 from service.web.pages.aim_plan import StepNumber, aim_view, excess
-from service.web.pages.calibration_result import OFFSETS, calibration_view
+from service.web.pages.calibration_result import MOST, OFFSETS, calibration_view
 from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.pages import go_to, render
 
@@ -41,8 +42,8 @@ Number = Annotated[Version, Path(description="Id of the job.")]
 
 _PAGE = 50
 
-# Most names of a list that the page of a job shows, such as its heliostats.
-_SHOWN = 100
+# Most items of a list on a page of a job, such as its heliostats.
+_SHOWN = MOST
 
 
 @router.get("/jobs", dependencies=[READ])
@@ -172,10 +173,10 @@ def get_job_states_table(number: Number, runtime: RuntimeDep, kinds: KindsDep) -
 
 
 def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
-    """The first heliostats of a field forecast, sorted by a factor or their name."""
+    """The heliostats of a field forecast, sorted by a factor or their name."""
     lines = list(result.get("by_heliostat", {}).items())
     lines.sort(key=(lambda line: line[0]) if by == "name" else (lambda line: line[1][by]))
-    return lines[:_SHOWN]
+    return lines
 
 
 @router.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
@@ -186,15 +187,17 @@ def get_job_page(
     kinds: KindsDep,
     by: By = "name",
     step: StepNumber = 0,
+    page: Annotated[int, Query(ge=1, le=10**6)] = 1,
 ) -> HTMLResponse:
     """A job, which the page follows until it ends.
 
     The heliostats of a field forecast are sorted ``by`` their name or a factor, the least first.
-    Of a plan of aims the maps of one ``step`` are shown.
+    Of a plan of aims the maps of one ``step`` are shown, and of long lists one ``page``.
     While it runs, each update reads only what changes, but neither the payload nor the result.
     """
     with runtime.database.reading() as session:
         row = queue.get_summary(session, number)
+        begin = (page - 1) * _SHOWN
         is_live, asked, flux, aims = row.state not in queue.ENDED, None, None, None
         result: Mapping[str, Any] = {}
         calibration = None
@@ -207,7 +210,10 @@ def get_job_page(
                 _flux(row),
             )
             aims = aim_view(runtime, row, step)
-            calibration = calibration_view(session, row, result)
+            calibration = calibration_view(session, row, result, begin)
+    mirrors, skipped = _mirrors(result, by), {} if calibration else result.get("skipped", {})
+    lists = mirrors, skipped, *(result.get(name, ()) for name in ("surfaces", "unchanged"))
+    longest = calibration.longest if calibration else max(map(len, lists))
     return render(
         request,
         "job.html",
@@ -217,9 +223,9 @@ def get_job_page(
         flux=flux,
         has_changed=any(result.values()),
         chain=loss_chain(result["field"]) if result.get("field") else [],
-        mirrors=_mirrors(result, by),
+        mirrors=mirrors[begin : begin + _SHOWN],
         n_measured=len(result.get("states", ())),
-        n_mirrors=len(result.get("by_heliostat", ())),
+        n_mirrors=len(mirrors),
         factors=_FACTORS,
         by=by,
         light=result if row.kind == "forecasts" and "peak_w_m2" in result else None,
@@ -234,9 +240,13 @@ def get_job_page(
         surfaces=result.get("surfaces", {}),
         unchanged=result.get("unchanged", {}),
         judged=result.get("judged", {}),
-        skipped={} if calibration else result.get("skipped", {}),
+        skipped=skipped,
         warnings=result.get("warnings", []),
         shown=_SHOWN,
+        begin=begin,
+        page=page,
+        last=math.ceil(longest / _SHOWN),
+        link=lambda page: f"/jobs/{number}?by={by}&step={step}&page={page}#result-title",
     )
 
 

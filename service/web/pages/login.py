@@ -24,10 +24,9 @@ def own_path(wanted: str) -> str:
     return wanted if _OWN_PATH.fullmatch(wanted) else "/"
 
 
-_WRONG = "This key is not valid: it may be mistyped or withdrawn. Try again, or ask for another."
+_WRONG = "This key is not valid: it may be mistyped, expired or withdrawn. Ask for another."
 _ENDED = (
-    "The session of this browser has ended: its time is over, or its key was withdrawn. Log in"
-    " again."
+    "The session of this browser has ended: its time is over, or that of its key. Log in again."
 )
 
 

@@ -23,6 +23,7 @@ from service.base.fields import (
     ReadVersion,
     Reason,
 )
+from service.drawing.charts import PlanePicture
 from service.drawing.pictures import photograph_picture
 from service.drawing.templates import in_words
 from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
@@ -225,6 +226,7 @@ def get_photograph_page(
         kept={kind: image for kind, image in images.items() if image.has_file},
         comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
         trouble=trouble,
+        plane_picture=PlanePicture,
         unchanged=unchanged,
         is_excluded=row.reason == EXCLUDED,
         corrections=[(row, change_texts(row)) for row in corrections],

@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from typing import Annotated, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -10,6 +9,7 @@ from fastapi.responses import HTMLResponse
 from model.errors import InvalidInputError, ModelError
 from service.base.errors import NotFoundError, ServiceError
 from service.base.fields import ReadVersion, Reason, Version
+from service.drawing.charts import PlanePicture
 from service.store import audit
 from service.store.photographs.correction_log import newest_correction
 from service.store.photographs.groups import count_groups, get_group, list_groups
@@ -23,10 +23,11 @@ from service.twin.photographs.corrections import (
 from service.twin.photographs.display import compare_one
 from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.pages.heliostat import comparison_figures
-from service.web.pages.photograph_list import PhotographsQuery
+from service.web.resources.photographs import PhotographsQuery
 from service.web.responses.pages import go_to, render
 
-router = APIRouter(include_in_schema=False, prefix="/photographs/review")
+_PATH = "/photographs/review"
+router = APIRouter(include_in_schema=False, prefix=_PATH)
 
 REASONS = (
     "clouds",
@@ -45,11 +46,6 @@ class ReviewQuery(PhotographsQuery):
 
     at: Version | None = None
     undo: Version | None = None
-
-    def review(self, path: str = "/photographs/review", **more: int | None) -> str:
-        """The URL of the queue with these filters."""
-        asked = self.filters | {name: str(one) for name, one in more.items() if one is not None}
-        return f"{path}?{urlencode(asked)}" if asked else path
 
     @property
     def filters(self) -> dict[str, str]:
@@ -82,7 +78,7 @@ def get_review_page(
     with runtime.database.reading() as session:
         version = newest_correction(session)
         chosen = query.filter(session, plant_time_zone(session, runtime.settings.time_zone))
-        listed = list_groups(session, chosen, 1, query.before) if query.at is None else []
+        listed = list_groups(session, chosen, 1, query.after) if query.at is None else []
         group = get_group(session, query.at) if query.at else next(iter(listed), None)
         total, place, following = count_groups(session, chosen), 0, None
         if group is not None:
@@ -107,6 +103,7 @@ def get_review_page(
         total=total,
         comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
         trouble=trouble,
+        plane_picture=PlanePicture,
         reasons=REASONS,
     )
 
@@ -134,8 +131,8 @@ def post_review_form(
             lambda session: audit.record(session, actor, "measurement.reviewed", subject)
         )
     if form.next is None:
-        return go_to(form.review(before=form.at, undo=undo))
-    return go_to(form.review(at=form.next, undo=undo))
+        return go_to(form.link(_PATH, after=form.at, undo=undo))
+    return go_to(form.link(_PATH, at=form.next, undo=undo))
 
 
 @router.post("/undo", dependencies=[OPERATE, COMPUTE_SLOT])
@@ -152,4 +149,4 @@ def post_undo_form(
     changes = PhotographChanges("review undone", excluded=bool(correction.before["excluded"]))
     with suppress(NothingToChangeError):
         correct_photograph(runtime, name, row.identifier, changes, identity.name, form.undo)
-    return go_to(form.review(at=row.id))
+    return go_to(form.link(_PATH, at=row.id))

@@ -36,7 +36,7 @@ from service.web.auth.dependencies import (
     RuntimeDep,
     require_multipart,
 )
-from service.web.pages.photograph_list import PhotographsQuery, target_names
+from service.web.resources.photographs import PhotographsQuery, target_names
 from service.web.responses.pages import go_to, render
 
 router = APIRouter(include_in_schema=False, prefix="/photographs/times")

@@ -29,7 +29,7 @@ from service.base.fields import (
 from service.base.names import IDENTIFIER
 from service.sources.photograph import Photograph
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.forecasts.heliostat_forecast import position_of
+from service.twin.forecasts.requests import position_of
 from service.twin.photographs.repeats import ReceivedPhotograph, receive
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
@@ -40,7 +40,7 @@ from service.web.auth.dependencies import (
     RuntimeDep,
     require_multipart,
 )
-from service.web.pages.photograph_list import target_names
+from service.web.resources.photographs import target_names
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, prefix="/photographs/upload")

@@ -5,7 +5,7 @@ A plan compares the twin with ideal mirrors, and with the flux that the receiver
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Annotated, Literal
+from typing import Annotated
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -19,7 +19,7 @@ from model.errors import InvalidInputError
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import NotFoundError
-from service.base.fields import FormMoment, Lines, Model, Name, Version, plant_time_to_utc
+from service.base.fields import FormMoment, Lines, Name, Version, plant_time_to_utc
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_zone
@@ -30,12 +30,13 @@ from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
+from service.store.tables import PlantRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
-from service.web.pages.forecast import WHENS, When, time_of
+from service.web.pages.forecast import WHENS, SunlightForm, When, sunlight_fields, time_of
 from service.web.pages.plan_aims import aims_for, plan_with
 from service.web.responses.pages import go_to, leave_for, render
 
@@ -45,7 +46,11 @@ LISTED = 20
 """Plans on a page of the list."""
 
 
-class PlanForm(Model):
+_SHARED = ("name", "target", "first_at", "last_at", "step_minutes", "aim_plan")
+"""Fields that form and request have alike."""
+
+
+class PlanForm(SunlightForm):
     """The form. ``heliostats`` has one name a line.
 
     An optional aim follows the name: right and up of the middle [m]. ``aim_plan`` is the number of
@@ -61,8 +66,6 @@ class PlanForm(Model):
     allowed_kw_m2: float | None = Field(default=None, gt=0, le=1e5)
     limit_map_kw_m2: Lines = ""
     aim_plan: Version | None = None
-    sunlight: Literal["given", "clear_sky"] = "given"
-    dni_w_m2: float = Field(default=1000.0, gt=0, le=2000)
 
     def chosen(self) -> dict[str, tuple[float, float] | None]:
         """Heliostats with their aims, or None without an aim.
@@ -106,16 +109,11 @@ class PlanForm(Model):
         chosen = self.chosen()
         try:
             return PlanIn(
-                name=self.name,
-                target=self.target,
-                first_at=self.first_at,
-                last_at=self.last_at,
-                step_minutes=self.step_minutes,
+                **{name: getattr(self, name) for name in _SHARED},
                 heliostats=list(chosen) or None,
                 aim_offsets_m={name: aim for name, aim in chosen.items() if aim is not None},
                 allowed_w_m2=None if self.allowed_kw_m2 is None else 1e3 * self.allowed_kw_m2,
-                dni_w_m2="clear_sky" if self.sunlight == "clear_sky" else self.dni_w_m2,
-                aim_plan=self.aim_plan,
+                dni_w_m2=self.given_dni,
             )
         except ValidationError as error:
             raise RequestValidationError(error.errors()) from error
@@ -143,13 +141,8 @@ def _filled(asked: PlanIn) -> PlanForm:
     """The form from which a plan was requested."""
     aims = {name: f"{name} {right:g} {up:g}" for name, (right, up) in asked.aim_offsets_m.items()}
     lines = [aims.get(name, name) for name in asked.heliostats or ()]
-    given = {
-        name: getattr(asked, name)
-        for name in ("name", "target", "first_at", "last_at", "step_minutes", "aim_plan")
-    }
-    is_clear = asked.dni_w_m2 == "clear_sky"
-    given |= {"sunlight": "clear_sky" if is_clear else "given"}
-    given |= {"dni_w_m2": 1000.0 if is_clear else asked.dni_w_m2}
+    given = {name: getattr(asked, name) for name in _SHARED}
+    given |= sunlight_fields(asked.dni_w_m2)
     allowed = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
     return PlanForm.model_construct(**given, heliostats="\n".join(lines), allowed_kw_m2=allowed)
 
@@ -159,7 +152,7 @@ def _filled(asked: PlanIn) -> PlanForm:
 
 
 @dataclass(frozen=True)
-class Step:
+class PlanStep:
     """A time of a plan: the sun, and the load on the receiver by the twin and by ideal mirrors."""
 
     at: datetime
@@ -182,30 +175,30 @@ class Day:
     ``energy_wh`` [Wh] is None if the plan has a single time. ``allowed_w_m2`` is the limit, if any.
     """
 
-    steps: list[Step]
+    steps: list[PlanStep]
     chosen: int
     timelines: list[Timeline]
     maps: dict[str, HeatMap]
     energy_wh: dict[str, float | None]
     allowed_w_m2: float | None
 
-    def excess(self, step: Step) -> float:
+    def excess(self, step: PlanStep) -> float:
         """By how much the twin's flux exceeds the limit at a time, as a share of it [1], or 0."""
         allowed = self.allowed_w_m2
         return 0.0 if allowed is None else max(0.0, step.twin["peak_w_m2"] / allowed - 1)
 
     @property
-    def exceeded(self) -> list[Step]:
+    def exceeded(self) -> list[PlanStep]:
         """The times at which the flux exceeds the limit."""
         return [step for step in self.steps if self.excess(step) > 0]
 
     @property
-    def worst(self) -> Step:
+    def worst(self) -> PlanStep:
         """The time of the largest flux."""
         return max(self.steps, key=lambda step: step.twin["peak_w_m2"])
 
 
-def _series(steps: list[Step], figure: str, scale: float) -> dict[str, list[Value]]:
+def _series(steps: list[PlanStep], figure: str, scale: float) -> dict[str, list[Value]]:
     return {
         name: [
             Value(step.at, scale * of[figure])
@@ -216,7 +209,7 @@ def _series(steps: list[Step], figure: str, scale: float) -> dict[str, list[Valu
     }
 
 
-def _energy(steps: list[Step], kind: str) -> float | None:
+def _energy(steps: list[PlanStep], kind: str) -> float | None:
     """Energy by the trapezoidal rule [Wh], None for a single time."""
     hours = [(step.at - steps[0].at).total_seconds() / 3600 for step in steps]
     return (
@@ -260,7 +253,7 @@ def _day(session: Session, row: JobRow, at: int | None, zone: str) -> Day:
     """A finished plan with the maps of one time. Other maps are not loaded."""
     assert row.result is not None
     steps = [
-        Step(
+        PlanStep(
             datetime.fromisoformat(step["at"]),
             step["sun"],
             step.get("dni_w_m2"),
@@ -334,7 +327,8 @@ def get_plans_page(
         asked = None if aims is None else plan_with(session, aims)
         context = _context(runtime, session, after, asked)
         if when is not None:
-            context["filled"] = _at(context["filled"], time_of(when, str(context["zone"])))
+            at = time_of(when, str(context["zone"]), session.get(PlantRow, 1))
+            context["filled"] = _at(context["filled"], at)
     return render(request, "plan.html", **context, job=None, day=None)
 
 
@@ -385,7 +379,7 @@ def post_plan_form(
     with runtime.database.reading() as session:
         form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
     payload = form.payload()
-    row = enqueue(runtime, plans.KIND, payload, identity.name)
+    row = enqueue(runtime, plans.KIND, payload, identity.name).row
     return leave_for(request, f"/plans/{row.id}")
 
 
@@ -402,5 +396,5 @@ def post_aims_form(
         raise RequestValidationError(error.errors()) from error
     if payload is None:
         raise InvalidInputError("allowed_kw_m2: give the flux that the receiver can take")
-    row = enqueue(runtime, aim_plans.KIND, payload, identity.name)
+    row = enqueue(runtime, aim_plans.KIND, payload, identity.name).row
     return leave_for(request, f"/jobs/{row.id}")

@@ -7,7 +7,6 @@ from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
 from service.base.errors import ConflictError, NotFoundError
-from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import aim_plans
 from service.jobs.kinds.aim_plans import AimPlanIn, DayIn
 from service.jobs.kinds.plans import PlanIn
@@ -15,9 +14,12 @@ from service.store.jobs import queue
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.dependencies import OPERATE, IdentityDep, RuntimeDep
 from service.web.pages.aim_plan import Number
-from service.web.responses.pages import go_to
+from service.web.responses.pages import go_to_job
 
 router = APIRouter(include_in_schema=False)
+
+_SHARED = ("heliostats", "target", "plane", "receiver", "dni_w_m2")
+"""Fields that a plan has from aims, and aims from a plan."""
 
 
 def aims_for(
@@ -37,18 +39,9 @@ def aims_for(
         last=last.time() if last.date() == first.date() else time(23, 59),
         step_minutes=asked.step_minutes,
     )
-    return AimPlanIn(
-        heliostats=asked.heliostats,
-        target=asked.target,
-        plane=asked.plane,
-        receiver=asked.receiver,
-        neighbours=asked.neighbours,
-        measured_states=asked.measured_states,
-        dni_w_m2=asked.dni_w_m2,
-        model_version=asked.model_version,
-        day=day,
-        limit_w_m2=limit,
-    )
+    names = (*_SHARED, "neighbours", "measured_states", "model_version")
+    same = {name: getattr(asked, name) for name in names}
+    return AimPlanIn(**same, day=day, limit_w_m2=limit)
 
 
 def plan_with(session: Session, number: int) -> PlanIn:
@@ -67,12 +60,8 @@ def plan_with(session: Session, number: int) -> PlanIn:
     asked = AimPlanIn.model_validate(row.payload)
     limit = asked.limit_w_m2
     return PlanIn(
+        **{name: getattr(asked, name) for name in _SHARED},
         name=f"aims of job {number}",
-        heliostats=asked.heliostats,
-        target=asked.target,
-        plane=asked.plane,
-        receiver=asked.receiver,
-        dni_w_m2=asked.dni_w_m2,
         first_at=datetime.fromisoformat(times[0]),
         last_at=datetime.fromisoformat(times[-1]),
         step_minutes=60.0 if asked.day is None else asked.day.step_minutes,
@@ -92,4 +81,4 @@ def post_aims_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -
         payload = aims_for(PlanIn.model_validate(row.payload), zone)
     if payload is None:
         raise ConflictError(f"plan {number} has no limit; plan it again with an allowed flux")
-    return go_to(f"/jobs/{enqueue(runtime, aim_plans.KIND, payload, identity.name).id}")
+    return go_to_job(runtime, aim_plans.KIND, payload, identity)

@@ -6,7 +6,7 @@ from types import NoneType
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -14,15 +14,20 @@ from sqlalchemy.orm import Session
 from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.receivers import Cavity
 from service import store
-from service.base.fields import Version
+from service.base.fields import JsonObject, Version
 from service.drawing.templates import figure
+from service.jobs.kinds import measurements
+from service.jobs.kinds.measurements import MeasurementsIn
 from service.sources.documents import describe_sun
 from service.sources.plant_schema import FacetGridEntry, HeliostatTypeEntry
 from service.store import audit, keys
 from service.store.tables import MeasurementRow, PlantRow, ReceiverRow, TargetRow
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.plant import model_versions
-from service.web.auth.dependencies import ADMIN, READ, RuntimeDep
-from service.web.responses.pages import render
+from service.twin.plant.model_versions import CameraAnswer
+from service.web.api.plant import read_camera_choice
+from service.web.auth.dependencies import ADMIN, OPERATE, READ, IdentityDep, RuntimeDep
+from service.web.responses.pages import go_to_job, render
 
 router = APIRouter(include_in_schema=False, prefix="/plant")
 
@@ -54,28 +59,18 @@ def _targets(session: Session) -> Sequence[tuple[TargetRow, int]]:
     return [(row, count) for row, count in session.execute(counted.order_by(TargetRow.name))]
 
 
-@dataclass(frozen=True)
-class ReceiverLine:
-    """A receiver in the table: its row, and sizes [m, m2] of the surface and of a cavity's
-    opening.
-    """
-
-    row: ReceiverRow
-    width: float
-    panels: int | None
-    opening: float | None
+_NO_SIZES: JsonObject = dict.fromkeys(("radius", "opening_deg", "panels", "aperture_m2"))
 
 
-def _receiver_line(row: ReceiverRow) -> ReceiverLine:
+def _surface(row: ReceiverRow) -> JsonObject:
+    """Sizes [m, m2] of a receiver and of a cavity's opening; those that it lacks are None."""
     receiver = store.stored_receiver(row)
-    opening = None
+    sizes = _NO_SIZES | receiver_as_json(receiver)
     if isinstance(receiver, Cavity):
         corners = receiver.aperture
         parts = np.cross(corners, np.roll(corners, -1, axis=0))
-        opening = float(np.linalg.norm(parts.sum(axis=0)) / 2)
-    return ReceiverLine(
-        row, receiver.width, None if row.panels is None else len(row.panels), opening
-    )
+        sizes["aperture_m2"] = float(np.linalg.norm(parts.sum(axis=0)) / 2)
+    return sizes
 
 
 @dataclass(frozen=True)
@@ -116,8 +111,9 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
     with runtime.database.reading() as session:
         plant = session.get(PlantRow, 1)
         targets = _targets(session)
-        receivers = [_receiver_line(row) for row in store.list_receivers(session)]
+        receivers = [(row, _surface(row)) for row in store.list_receivers(session)]
         model = None if plant is None else model_versions.get_model(session)
+        camera = None if plant is None else read_camera_choice(session)
     sun = None if model is None else describe_sun(model.optics.sun_shape)
     return render(
         request,
@@ -130,7 +126,17 @@ def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
         place=_place,
         located_by=_located_by,
         sun=sun,
+        camera=camera,
     )
+
+
+@router.post("/camera", dependencies=[OPERATE])
+def post_camera_form(
+    camera: Annotated[CameraAnswer, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Begin the job that declares what images without background are, and measures them again."""
+    payload = MeasurementsIn(camera=camera, reason="their camera was declared")
+    return go_to_job(runtime, measurements.KIND, payload, identity)
 
 
 @router.get("/settings", dependencies=[ADMIN])

@@ -170,12 +170,13 @@ class AlarmQuery(AlarmFilter):
     acknowledged: bool = False
     sort: Literal["severity", "newest", "oldest", "heliostat"] = "severity"
     done: Version | None = None
+    page: Annotated[int, Field(ge=1, le=10**6)] = 1
 
     _filled = model_validator(mode="before")(drop_empty_fields)
 
     def link(self, path: str = "/alarms", **changes: object) -> str:
         """The URL of ``path`` with these filters, and with changes."""
-        changed = self.model_copy(update={"done": None} | changes)
+        changed = self.model_copy(update={"done": None, "page": 1} | changes)
         asked = changed.model_dump(exclude_defaults=True)
         query = urlencode({key: "true" if value is True else value for key, value in asked.items()})
         return f"{path}?{query}" if query else path

@@ -43,9 +43,9 @@ from service.base.fields import (
     start_of_day,
 )
 from service.base.names import LINE
+from service.drawing.discrepancy_chart import amount_charts
 from service.drawing.study_report import VERDICTS, report_page
 from service.jobs.costs import study_cost
-from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.listing import Order, Period
@@ -67,7 +67,6 @@ from service.twin.studies.field_change import (
 )
 from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.twin.studies.study import MAX_STUDY_IMAGES, StudyIn, Surfaces, extent_of
-from service.web.api.jobs import add_creator
 from service.web.api.models import ModelOut, current_out, model_out
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -80,7 +79,7 @@ from service.web.auth.dependencies import (
 )
 from service.web.resources.study_charts import study_timelines
 from service.web.responses.openapi import TEXT, problems
-from service.web.responses.pages import go_to, render
+from service.web.responses.pages import go_to, go_to_job, render
 from service.web.responses.paging import OrderQuery, Page, Since, Until, page
 
 router = APIRouter(tags=["studies"])
@@ -131,6 +130,12 @@ class StudySummary(BaseModel):
     open_questions: list[str] = Field(
         description="What it leaves open; to adopt it then needs a reason."
     )
+    adopts: list[str] = Field(
+        description=(
+            "What its adoption adds to the model: effects, or `correction (no cause)` for what has"
+            " no name."
+        )
+    )
     adoption: InstanceOf[StudyState] = Field(exclude=True, description="For pages.")
 
 
@@ -158,9 +163,9 @@ class AdoptIn(Model):
     force: Flag = Field(
         default=False,
         description=(
-            "Also where its verdict is not `effect`, or another version of the model is current by"
-            " now, which it then takes the place of; with a reason, also where it makes photographs"
-            " after the study significantly worse."
+            "Also where another version of the model is current by now, which it then takes the"
+            " place of; with a reason, also where it makes photographs after the study"
+            " significantly worse."
         ),
     )
     until: Annotated[EffectEnds, Field(max_length=100)] = Field(
@@ -273,6 +278,7 @@ def _about(state: StudyState) -> dict[str, object]:
         "adopted": state.adopted,
         "state": state.state,
         "open_questions": questions,
+        "adopts": state.adopts,
         "adoption": state,
     }
 
@@ -285,14 +291,16 @@ def study_figures(runtime: Runtime, study: StudyOut) -> dict[str, object]:
         has_page = store.has_study_page(session, study.id)
         outdated = store.outdated_surfaces(session, model_versions.current_version(session))
     n_forecasts = len(heliostats_to_forecast(study.heliostats))
+    found = study.discrepancy
     return {
         "timelines": study_timelines(study, taken, zone),
+        "amounts": [] if found is None else amount_charts(found.model_dump()["coefficients"]),
         "parameters": [
             (effect, name, fitted)
             for effect in study.effects
             for name, fitted in effect.parameters.items()
         ],
-        "accuracy": AccuracyChange.of(study.before.per_image, study.after.per_image),
+        "accuracy": AccuracyChange.of(study.before.per_image, study.accuracies),
         "n_forecasts": n_forecasts,
         "forecast_s": EACH_S * n_forecasts,
         "has_page": has_page,
@@ -376,9 +384,6 @@ def get_new_study_page(
         )
 
 
-add_creator(router, KINDS["studies"], "/studies", "post_study")
-
-
 @pages.post("/studies", dependencies=[OPERATE])
 def post_study_form(
     form: Annotated[NewStudyForm, Form()], runtime: RuntimeDep, identity: IdentityDep
@@ -386,7 +391,7 @@ def post_study_form(
     """Enqueue the study, and go to the page of the job."""
     with runtime.database.reading() as session:
         body = form.body(session, plant_time_zone(session, runtime.settings.time_zone))
-    return go_to(f"/jobs/{enqueue(runtime, KINDS['studies'], body, identity.name).id}")
+    return go_to_job(runtime, KINDS["studies"], body, identity)
 
 
 @router.get(
@@ -416,13 +421,13 @@ def get_change_page(
     request: Request, runtime: RuntimeDep, study: Annotated[StudyOut, Depends(get_study)]
 ) -> HTMLResponse:
     """What adopting a study would change in forecasts. They are computed for this page."""
-    if not study.effects:
+    if not study.adopts:
         raise ConflictError(f"study {study.id} found no effect; adopting it changes nothing")
     return render(
         request,
         "study_change.html",
         study=study,
-        accuracy=AccuracyChange.of(study.before.per_image, study.after.per_image),
+        accuracy=AccuracyChange.of(study.before.per_image, study.accuracies),
         changes=forecast_changes(runtime, study.id),
         field=read_field_change(runtime, study.id),
     )
@@ -495,7 +500,9 @@ def adopt_study(
 ) -> AdoptedOut:
     """Adopt the result of a study. It becomes the current version of the plant model.
 
-    The response is 409 if it makes photographs after the study significantly worse.
+    What has no name is adopted as a correction, and never as a cause. The response is 409 if what
+    was found explains only a part of the error, or if a correction makes heliostats or days worse
+    that no fit saw. It is also 409 if it makes photographs after the study significantly worse.
     """
     return _adopt(runtime, number, identity.name, request or AdoptIn())
 
@@ -564,4 +571,4 @@ def post_predict_again_form(
             "all surfaces were made by the current model, or one that was waits aside"
         )
     body = PredictionsIn(heliostats=names, method=method)
-    return go_to(f"/jobs/{enqueue(runtime, KINDS['predictions'], body, identity.name).id}")
+    return go_to_job(runtime, KINDS["predictions"], body, identity)

@@ -24,8 +24,11 @@ from service.base.arrays import pack
 from service.base.errors import NotFoundError
 from service.drawing.charts import Figure
 from service.drawing.templates import ASSETS, environment, form_time, moment, times_in_zone
+from service.jobs.enqueuing import enqueue
+from service.jobs.kind import Kind, Payload
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.auth.security import Identity, Role
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.security import LOCAL, Identity, Role
 from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
 from service.web.responses.fragments import Part
 
@@ -197,6 +200,8 @@ def _text(
     }
     counted = getattr(getattr(scope.get("app"), "state", None), "alarms", None)
     may["alarm_count"] = count_badge(0 if counted is None else counted.last)
+    if identity == LOCAL:
+        may["store"] = scope["app"].state.runtime.settings.store
     path, query = scope.get("path", ""), scope.get("query_string", b"").decode("ascii", "replace")
     rendering = _Rendering(quote(path) + (f"?{query}" if query else ""), zone)
     token = _RENDERING.set(rendering)
@@ -257,6 +262,13 @@ def _file(content: str | bytes, name: str, suffix: str) -> HTMLResponse:
 def go_to(path: str) -> Response:
     """Redirect after a form. htmx takes the part that it requested from the new page."""
     return RedirectResponse(path, HTTPStatus.SEE_OTHER)
+
+
+def go_to_job(
+    runtime: Runtime, kind: Kind[Payload], payload: Payload, identity: Identity
+) -> Response:
+    """Enqueue the job that a form asks for, and go to its page."""
+    return go_to(f"/jobs/{enqueue(runtime, kind, payload, identity.name).row.id}")
 
 
 def leave_for(request: Request, path: str) -> Response:

@@ -108,6 +108,9 @@ TYPES: dict[int, str] = {
 The names never change.
 """
 
+SPECIAL_TYPES: dict[type, str] = {errors.IdempotencyReuseError: "idempotency-key-reused"}
+"""Problem types of errors that have another one than their status."""
+
 
 def request_id(scope: Scope) -> str:
     """The id of the request, from `service.web.middleware`."""
@@ -119,14 +122,17 @@ def problem(
     status: int,
     detail: str,
     headers: Mapping[str, str] | None = None,
+    name: str | None = None,
     **extension: Any,
 ) -> Response:
     """Response with a problem document, or with an error page for a browser.
 
+    ``name`` is that of its type, by default the one of its status in `TYPES`.
     The JSON is ASCII, so that any text in it can be sent.
     """
+    name = name or TYPES.get(status, TYPES[400 if status < 500 else 500])
     document = {
-        "type": f"urn:heliotwin:problem:{TYPES.get(status, TYPES[400 if status < 500 else 500])}",
+        "type": f"urn:heliotwin:problem:{name}",
         "title": HTTPStatus(status).phrase,
         "status": status,
         "detail": detail,
@@ -159,7 +165,8 @@ def _on_known(request: Request, error: Exception) -> Response:
         ]
         return problem(request.scope, status, str(error), errors=field_errors)
     if status is HTTPStatus.UNPROCESSABLE_ENTITY:
-        return problem(request.scope, status, str(error), errors=[_named_problem(error)])
+        name = SPECIAL_TYPES.get(type(error))
+        return problem(request.scope, status, str(error), name=name, errors=[_named_problem(error)])
     wait_s = _RETRY_AFTER_S.get(type(error))
     return problem(
         request.scope, status, str(error), {} if wait_s is None else {"Retry-After": wait_s}
@@ -169,7 +176,7 @@ def _on_known(request: Request, error: Exception) -> Response:
 # Forms in which messages name a field: `field: what to do`, `where: 'field' what to do` or `where:
 # field must ..`.
 _NAMED = re.compile(
-    r"([A-Za-z_][\w.]*): (.+)|(?:[^:]+: )?(?:'([\w.]+)' .+|(\w+) must .+)", re.DOTALL
+    r"([A-Za-z_][\w.-]*): (.+)|(?:[^:]+: )?(?:'([\w.]+)' .+|(\w+) must .+)", re.DOTALL
 )
 
 
@@ -189,7 +196,8 @@ def _named_problem(error: Exception) -> dict[str, str]:
 def _field_problem(entry: Mapping[str, Any]) -> dict[str, str]:
     """The wrong field and what to do about it.
 
-    The field is without the part of the request that holds it, such as `body`.
+    The field is without the part of the request that holds it, such as `body`, or the part
+    `metadata` of a form.
     """
     location = entry["loc"]
     inner = (
@@ -197,6 +205,8 @@ def _field_problem(entry: Mapping[str, Any]) -> dict[str, str]:
         if location and location[0] in ("body", "path", "query", "header")
         else location
     )
+    if inner[:1] == ("metadata",) and inner[1:]:
+        inner = inner[1:]
     if entry["type"] == "json_invalid" and isinstance(location[-1], int):
         inner = ()  # here the location is a position in the text, not a field
     return {"field": field_of(inner) or "body", "message": message_of(entry)}

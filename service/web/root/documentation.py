@@ -25,7 +25,7 @@ MOUNT = (
     "/docs",
     KnownFiles(
         _STATIC,
-        ["swagger-ui.css", "swagger-ui-bundle.js", "start.js"],
+        ["swagger-ui.css", "swagger-ui-bundle.js", "start.js", "docs.css"],
         "max-age=3600",
         packages=[("fastapi_offline", "static")],
     ),

@@ -159,9 +159,9 @@ def test_photograph_is_found_looked_at_and_corrected(seen: Any, size: dict[str, 
     follow(seen, "text=Find")
     follow(seen, "tbody th a >> nth=0")
     expect(seen.locator("h1")).to_have_text("Photograph 3 of AA39")
-    for shown in ("outlined", "crop"):
-        expect(seen.locator(f"img[src$='{shown}.jpg']")).to_be_visible()
-    expect(seen.locator(".sides figcaption")).to_contain_text(
+    for shown in ("img[src$='outlined.jpg']", "image[href$='crop.jpg']"):
+        expect(seen.locator(shown)).to_be_visible()
+    expect(seen.locator(".columns figcaption")).to_contain_text(
         ["photograph", "target", "its light", "forecast", "diff"]
     )
     expect(seen.locator("main")).to_contain_text("red where the forecast is brighter")
@@ -213,7 +213,7 @@ def test_study_says_what_matters_and_adopting_what_is_of_before(seen: Any):
 @SIZES
 def test_flux_of_the_field_has_units(seen: Any):
     seen.goto("/jobs/1")
-    expect(seen.locator(".tiles").nth(1)).to_contain_text("Reflected by the mirrors")
+    expect(seen.locator(".tiles").nth(0)).to_contain_text("Reflected by the mirrors")
     expect(seen.locator("figure svg image")).to_be_visible()
     text = seen.locator("main").inner_text()
     assert "{" not in text

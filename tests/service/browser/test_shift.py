@@ -4,7 +4,7 @@ desk and on a phone.
 
 import re
 from collections.abc import Iterator
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from sqlalchemy import delete, update
 
 from model.ephemeris import sun_angles_at
 from service import store
+from service.base.fields import plant_time_to_utc
 from service.base.settings import Settings
 from service.store import keys
 from service.store.columns import now
@@ -202,8 +203,11 @@ def test_operator_asks_for_a_forecast(page: Any):
     expect(page.locator("[name=moment]")).to_have_value("2026-06-21 11:36")
     # A time that the form offers is filled in, and is what is asked by.
     page.fill("[name=azimuth_deg]", "200")
-    page.click("text=Noon tomorrow")
-    expect(page.locator("[name=moment]")).to_have_value(re.compile("12:00$"))
+    page.click("text=Solar noon tomorrow")
+    moment = page.locator("[name=moment]")
+    expect(moment).to_have_value(re.compile(r"^(?!2026-06-21)\d{4}-\d\d-\d\d \d\d:\d\d$"))
+    at = plant_time_to_utc(datetime.fromisoformat(moment.input_value()), "Europe/Berlin")
+    assert sun_angles_at(at, ORIGIN)[0] == pytest.approx(180, abs=0.5)
     expect(page.locator("[value=time]")).to_be_checked()
     assert "/forecasts/" in page.url
 

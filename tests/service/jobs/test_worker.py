@@ -66,7 +66,7 @@ def ask(runtime: Runtime, **payload: Any) -> int:
 
 def ask_kind(runtime: Runtime, **payload: Any) -> int:
     """Enqueue a job as a request does, by its kind; its payload decides whether it is short."""
-    return enqueue(runtime, TEST_KINDS["squares"], SquareIn(**payload), "tester").id
+    return enqueue(runtime, TEST_KINDS["squares"], SquareIn(**payload), "tester").row.id
 
 
 def look(runtime: Runtime, number: int) -> JobRow:
@@ -237,7 +237,7 @@ def test_racing_requests_with_one_key_make_one_job(runtime: Runtime):
 
 
 def test_queue_has_a_bound_in_total_and_for_each_key(runtime: Runtime):
-    bounds = queue.Bounds(queued=3, queued_of_key=2)
+    bounds = queue.QueueBounds(queued=3, queued_of_key=2)
 
     def add(key: str) -> None:
         queue.add_job(session, "squares", {}, key, bounds=bounds)
@@ -416,6 +416,7 @@ def test_job_that_has_ended_cannot_be_cancelled(runtime: Runtime):
 # --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_racing_workers_do_every_job_once(runtime: Runtime):
     numbers = [ask(runtime, value=value, steps=1) for value in range(40)]
     with working(runtime, 2), working(runtime, 2):
@@ -572,6 +573,7 @@ def test_workers_stop_while_one_of_them_is_being_replaced(
     until(lambda: not job_threads())
 
 
+@pytest.mark.full
 def test_job_that_reports_is_never_stopped_as_hanging(impatient: Runtime):
     number = ask(impatient, value=5, steps=8, pause_s=0.4, quiet_s=300.0)
     with working(impatient):

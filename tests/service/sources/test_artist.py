@@ -1,6 +1,7 @@
 """Scenarios of ARTIST: what is written is read as it was, and what cannot be said is named."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,11 +11,11 @@ import pytest
 from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Heliostat
-from model.surface import control_points
-from service.sources.folder import read_surface
+from model.surface import basis, control_points, heights, nominal_heights
+from service.sources.folder import measured_heights, read_surface
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.artist import read_artist
-from service.sources.plant_formats.artist_axes import first_tilt
+from service.sources.plant_formats.artist_axes import ON_ITS_SIDE, first_tilt
 from service.sources.plant_formats.artist_export import write_artist
 from service.sources.plant_formats.formats import read_foreign
 from tests.service.command import ends, heliotwin
@@ -214,6 +215,7 @@ JOINTS = f"{B1}/kinematics/deviations"
 PLANE, CYLINDER = "target_areas_planar/cal", "target_areas_cylindrical/main"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -272,3 +274,95 @@ def test_a_sofast_file_is_no_plant(tmp_path: Path):
         2,
         "put it into H/Deflectometry beside plant.yaml",
     )
+
+
+FOCAL_M = 100.0
+
+
+def even_splines(heliostat: Heliostat, focal_length_m: float, count: int = 40) -> np.ndarray:
+    """Evenly spaced control points (F, count, count, 3) [m] whose splines are paraboloids."""
+    u = (np.arange(4 * count) + 0.5) / (4 * count)
+    fit = np.linalg.pinv(basis(count, 3, u).values)
+    centers, axes, half_sizes = heliostat.facet_frames
+    found = []
+    for center, frame, half in zip(centers, axes, half_sizes, strict=True):
+        x, y = (size * np.linspace(-1, 1, count) for size in half)
+        place_x, place_y = (basis(count, 3, u).values @ along for along in (x, y))
+        z = (place_x[:, None] ** 2 + place_y**2) / (4 * focal_length_m)
+        grid = np.stack(np.broadcast_arrays(x[:, None], y, fit @ z @ fit.T), axis=-1)
+        found.append(center + grid @ frame)
+    return np.array(found)
+
+
+def written_spline(folder: Path, **more: np.ndarray) -> tuple[Heliostat, np.ndarray]:
+    """Heights (F, 8, 8) [m] that are read of even splines, of a heliostat of flat facets."""
+    heliostat = read_plant(write_three_mounts(folder)).plant.heliostats["B1"]
+    heliostat = replace(
+        heliostat, facets=tuple(replace(one, focal_length=None) for one in heliostat.facets)
+    )
+    place = folder / "B1" / "Deflectometry"
+    place.mkdir(parents=True)
+    points = even_splines(heliostat, FOCAL_M)
+    np.savez(place / "B1-nurbs-surface.npz", control_points=points, **more)
+    surface = read_surface(folder, heliostat)
+    assert surface is not None
+    return heliostat, measured_heights(heliostat, surface)
+
+
+def focused_heights(heliostat: Heliostat) -> np.ndarray:
+    facets = tuple(replace(one, focal_length=FOCAL_M) for one in heliostat.facets)
+    return nominal_heights(replace(heliostat, facets=facets))
+
+
+def test_a_spline_is_its_geometry(tmp_path: Path):
+    heliostat, z = written_spline(tmp_path)
+    np.testing.assert_allclose(z, focused_heights(heliostat), atol=1e-6)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("declared", [{"normals": np.zeros(3)}, {"parameters_are_positions": 1}])
+def test_of_a_fit_of_deflectometry_parameters_are_positions(tmp_path: Path, declared: dict):
+    """Its normals belong to places at the parameters, which traced light and heights then share."""
+    heliostat, z = written_spline(tmp_path, **declared)
+    expected = heights(heliostat, even_splines(heliostat, FOCAL_M), 3, True)
+    np.testing.assert_allclose(z, expected, atol=5e-7)
+    assert np.abs(z - focused_heights(heliostat)).max() > 5e-6
+
+
+def test_a_declaration_decides(tmp_path: Path):
+    heliostat, z = written_spline(tmp_path, normals=np.zeros(3), parameters_are_positions=0)
+    np.testing.assert_allclose(z, focused_heights(heliostat), atol=1e-6)
+
+
+@pytest.mark.parametrize("as_positions", [False, True])
+def test_focused_facets_of_even_control_points_return(tmp_path: Path, as_positions: bool):
+    """Read as its geometry a focused mirror is a design; else it is a measured one."""
+    plant, scenario = exported(tmp_path)
+    for name, one in plant.plant.heliostats.items():
+        points = even_splines(one, FOCAL_M) @ (ON_ITS_SIDE.T if name[0] == "A" else np.eye(3))
+        with h5py.File(scenario, "r+") as file:
+            for number, facet in enumerate(file[f"heliostats/{name}/surface/facets"].values()):
+                del facet["control_points"]
+                facet["control_points"] = points[number]
+    imported = read_artist(scenario, as_positions)
+    assert bool(imported.surfaces) == as_positions
+    if as_positions:
+        assert any("fits of deflectometry, a parameter" in note for note in imported.notes)
+        assert all(one.parameters_are_positions for one in imported.surfaces.values())
+    else:
+        for kind in imported.parts["heliostat_types"].values():
+            shape = kind["facet_shape"]
+            assert shape == "slant_range" or shape["focal_length_m"] == pytest.approx(100, rel=1e-3)
+
+
+def test_areas_that_no_plant_has_are_named_by_the_group_that_is_there(tmp_path: Path):
+    _, scenario = exported(tmp_path)
+    with h5py.File(scenario, "r+") as file:
+        file.move("target_areas_planar", "target_areas")
+        del file["target_areas_cylindrical"]
+        for area in file["target_areas"].values():
+            area["geometry"] = "convex_cylinder"
+        for group in (*file["heliostats"].values(), file["prototypes"]):
+            group.move("kinematics", "kinematic")
+    with pytest.raises(InvalidInputError, match=r"in target_areas: .* cal is left out"):
+        read_artist(scenario)

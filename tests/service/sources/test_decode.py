@@ -1,3 +1,4 @@
+import io
 import os
 import signal
 import struct
@@ -11,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from model.errors import InvalidInputError
 from service.base.errors import BusyError
@@ -196,6 +198,10 @@ def test_a_plain_tiff_is_decoded():
         (gray_tiff(_277=(3, 1, 60000)), "more than 4 samples or 16 bits"),
         (gray_tiff((60000, 99, 1, 0)), "unknown type"),
         (gray_tiff(_279=(4, 1, 65000)), "ends early"),
+        (gray_tiff((339, 3, 1, 2)), "of signed samples is not supported"),
+        (gray_tiff((339, 3, 1, 3)), "of floating-point or complex samples"),
+        (gray_tiff(_258=(3, 1, 12)), "of 9 to 15 bits"),
+        (gray_tiff(_258=(3, 1, 16), _262=(3, 1, 5)), "neither gray nor RGB"),
     ],
 )
 def test_a_tiff_that_readers_read_differently_is_refused(data, refusal):
@@ -315,3 +321,50 @@ def test_the_decoder_has_a_limit_of_its_own():
         check=True,
     )
     assert done.stdout.strip() == b"refused"
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_white_is_zero_at_every_depth(bits):
+    stored = np.frombuffer(PIXELS, f"<u{bits // 8}")
+    rows = len(stored) // 8
+    sizes = {"_257": (3, 1, rows), "_258": (3, 1, bits), "_278": (3, 1, rows)}
+    black_is_zero, white_is_zero = (
+        decode_image(gray_tiff(_262=(3, 1, kind), **sizes)) for kind in (1, 0)
+    )
+    assert np.array_equal(black_is_zero.ravel(), stored)
+    assert np.array_equal(white_is_zero, ~black_is_zero)
+
+
+TURNS = {
+    1: lambda seen: seen,
+    2: np.fliplr,
+    3: lambda seen: np.rot90(seen, 2),
+    4: np.flipud,
+    5: lambda seen: seen.T,
+    6: lambda seen: np.rot90(seen, 1),
+    7: lambda seen: np.rot90(seen, 2).T,
+    8: lambda seen: np.rot90(seen, -1),
+}
+"""What a camera stores of a picture, by the orientation that it writes."""
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+@pytest.mark.parametrize("suffix", ["JPEG", "PNG", "TIFF"])
+def test_orientation_is_applied_in_every_format(suffix, orientation):
+    seen = np.kron(np.arange(12, dtype=np.uint8).reshape(3, 4) * 20, np.ones((16, 16), np.uint8))
+    exif = Image.Exif()
+    exif[274] = orientation
+    more = {"tiffinfo": {274: orientation}} if suffix == "TIFF" else {"exif": exif}
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(TURNS[orientation](seen))).save(buffer, suffix, **more)
+    found = decode_image(buffer.getvalue())
+    assert found.shape == seen.shape
+    assert np.abs(found.astype(int) - seen).mean() < 2
+
+
+@pytest.mark.parametrize("behind", [b"x", b"x" * 100_000, b"x\xff\xd9", "itself"])
+def test_data_behind_a_jpeg_is_refused_by_one_rule(picture, behind):
+    data = encoded(picture, ".jpg")
+    with pytest.raises(InvalidInputError, match="other data behind the image"):
+        decode_image(data + (data if behind == "itself" else behind))
+    assert np.array_equal(decode_image(data + bytes(100)), decode_image(data))

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from heliotwin.folder_camera import read_image
 from model.errors import InvalidInputError
 from service.base.settings import Settings
-from service.cli.folder_camera import read_image
 from service.sources import documents
 from service.sources.files import require_regular
 from service.sources.folder import read_declared, read_folder

@@ -19,6 +19,7 @@ from service.sources.documents import (
     optics_to_json,
     read_heliostat,
     read_item,
+    read_json,
     read_measurement,
     read_targets,
 )
@@ -147,16 +148,16 @@ def test_declared_effects(tmp_path):
         ('{"declared": {"optics": []}}', "optics: document: must be a JSON object"),
         (
             '{"declared": {"optics": {"reflectivity": 1.2}}}',
-            "optics: reflectivity: must be less than or equal to 1",
+            "optics: reflectivity: must be 1 or less",
         ),
         (
             '{"declared": {"optics": {"reflectivity": true}}}',
-            "optics: reflectivity: must be a valid number",
+            "optics: reflectivity: must be a number",
         ),
         ('{"declared": {"optics": {"attenuation": 0.1}}}', "optics: attenuation: must be a list"),
         (
             '{"declared": {"optics": {"attenuation": [0, "a"]}}}',
-            "optics: attenuation.1: must be a valid number",
+            "optics: attenuation.1: must be a number",
         ),
         ('{"declared": {"optics": {"shine": 1}}}', "optics: shine: is not known here"),
     ],
@@ -247,3 +248,12 @@ def test_facets_in_another_order_are_refused():
     document["facet_properties"]["facets"] = 4
     with pytest.raises(InvalidInputError, match=r"facets: must be a list"):
         read_heliostat("AA39", document, origin)
+
+
+def test_json_may_begin_with_a_byte_order_mark_and_has_each_key_once(tmp_path: Path):
+    file = tmp_path / "twin.json"
+    file.write_bytes(b'\xef\xbb\xbf{"a": 1}')
+    assert read_json(file) == {"a": 1}
+    file.write_text('{"a": 1, "b": {"c": 1, "c": 2}}')
+    with pytest.raises(InvalidInputError, match="'c' is there twice; keep one"):
+        read_json(file)

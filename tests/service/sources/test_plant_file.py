@@ -132,7 +132,7 @@ def test_what_effects_need_of_a_type_is_read_and_stored(tmp_path: Path):
 MISTAKES = [
     # what is written, in place of what; the line, the key, and a part of the remedy
     ("kind: azimuth_elevation", "kind: az-el", 4, "heliostat_types.large.mount.kind", "'az-el' is none of azimuth_elevation, juelich, pitch_roll, target_aligned"),
-    ("reflectance: 0.95", "reflectance: 1.5", 8, "heliostat_types.large.reflectance", "less than or equal to 1, got 1.5"),
+    ("reflectance: 0.95", "reflectance: 1.5", 8, "heliostat_types.large.reflectance", "1 or less, got 1.5"),
     ("reflectance: 0.95", "reflectance: 0", 8, "heliostat_types.large.reflectance", "greater than 0, got 0"),
     ("reflectance:", "reflectence:", 8, "heliostat_types.large.reflectence", "did you mean reflectance?"),
     ("slope_error_mrad: 1.0", "slope_error_mrad: -1", 9, "heliostat_types.large.slope_error_mrad", "got -1"),
@@ -142,7 +142,7 @@ MISTAKES = [
     ("canting: on_axis", "canting: {}", 7, "heliostat_types.large.canting", "give one of focal_length_m, off_axis"),
     ("canting: on_axis", "canting: individual", 7, "heliostat_types.large.canting", "facets file"),
     ("mirror_offset_m: 0.2", "mirror_offset_m: 0.2, jitter_axis: third", 4, "heliostat_types.large.mount.jitter_axis", "'third' is none of first, second"),
-    ("reflectance: 0.95", "reference_elevation_deg: 91", 8, "heliostat_types.large.reference_elevation_deg", "less than or equal to 90"),
+    ("reflectance: 0.95", "reference_elevation_deg: 91", 8, "heliostat_types.large.reference_elevation_deg", "90 or less"),
     ("facets: {file: facets.csv}", "facets: {file: facets.csv}\n    canting: on_axis", 14, "heliostat_types.small.canting", "individual"),
     ("facet_shape: flat", "facet_shape: {focal_length: 3}", 6, "heliostat_types.large.facet_shape.focal_length", "did you mean focal_length_m?"),
     ("facet_shape: flat", "facet_shape: 320", 6, "heliostat_types.large.facet_shape", "{focal_length_m: ..}"),
@@ -176,6 +176,7 @@ MISTAKES = [
     ("width_m: 12,", "width_m: 12, camera: {pose: {position_m: [0, 90, 2], look_at_m: [0, 5, 40]}},", 19, "targets.cal.camera.pose", "focal_length_px, field_of_view_deg"),
     ("width_m: 12,", "width_m: 12, camera: {pose: {position_m: [0, -90, 2], look_at_m: [0, 5, 40], field_of_view_deg: 9}},", 19, "targets.cal.camera.pose.position_m", "behind the target"),
     ("tower: {radius_m: 8, height_m: 140}", "tower: 140", 20, "tower", "key: value, got 140"),
+    ("cal: {kind: plane, ", "cal: {kind: cylinder, ", 19, "targets.cal.kind", "Put it into receivers; heliostats aim at those too"),
     ("tower: {radius_m: 8, height_m: 140}", "tower:", 20, "tower", "has no value"),
     ("tower:", "towers:", 20, "towers", "did you mean tower?"),
     ("shape: pillbox", "shape: disc", 21, "sun.shape", "'disc' is none of pillbox, gaussian, buie"),
@@ -204,6 +205,15 @@ def test_each_mistake_is_named(
     assert key in said
     assert remedy in said
     assert "\n" not in said
+
+
+def test_a_cylinder_that_is_no_target_is_a_receiver(tmp_path: Path):
+    """The remedy of its refusal."""
+    cylinder = "  cal: {kind: cylinder, center_m: [0, 5, 40], radius_m: 3, height_m: 6}\n"
+    begin, end = PLANT.index("targets:"), PLANT.index("tower:")
+    text = (PLANT[:begin] + PLANT[end:]).replace("receivers:\n", f"receivers:\n{cylinder}")
+    read = read_plant(write_plant(tmp_path, text))
+    assert isinstance(read.receivers["cal"], Cylinder)
 
 
 LAYOUT_MISTAKES = [
@@ -254,6 +264,7 @@ def test_each_mistake_of_the_facets_is_named(tmp_path: Path, old: str, new: str,
     assert said in str(refused.value)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("make", "count", "kind"),
     [
@@ -306,7 +317,8 @@ def test_nothing_but_a_refusal(
     text = PLANT[: cut[0]] + put + PLANT[cut[0] + cut[1] :]
     layout = LAYOUT[: row[0]] + cell + LAYOUT[row[0] + row[1] :]
     path = write_plant(tmp_path_factory.mktemp("fuzz"), text, layout)
-    assert "\n" not in _refusal(path)
+    for line in _refusal(path).splitlines():
+        assert line.startswith((str(path), str(path.parent), "and "))
 
 
 VALUES = [
@@ -350,3 +362,14 @@ def test_no_bytes_do_harm(tmp_path_factory: pytest.TempPathFactory, data: bytes)
     path.write_bytes(data)
     with pytest.raises(InvalidInputError):
         read_plant(path)
+
+
+def test_all_mistakes_are_named_one_a_line(tmp_path: Path):
+    text = PLANT.replace("latitude_deg: 34.86", "latitude_deg: 134").replace("radius_m: 8, h", "h")
+    for folder in ("schema", "layout"):
+        (tmp_path / folder).mkdir()
+    said = _refusal(write_plant(tmp_path / "schema", text)).split("\n")
+    assert [line.split(", ")[1].split(":")[0] for line in said] == ["line 1", "line 16", "line 20"]
+    layout = "name,type,east_m,north_m,up_m\nA1,large,0,x,0\nA2,large,0,y,0\n"
+    said = _refusal(write_plant(tmp_path / "layout", layout=layout)).split("\n")
+    assert [line.partition(": north_m")[0][-6:] for line in said] == ["line 2", "line 3"]

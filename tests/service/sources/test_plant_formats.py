@@ -13,7 +13,12 @@ from model.frames import sun_angles
 from model.receivers import Cavity, Panels
 from service.drawing.plant_picture import surface_lines
 from service.sources.plant_file import read_plant
-from service.sources.plant_formats.formats import foreign_text, read_foreign
+from service.sources.plant_formats.formats import (
+    ExportOptions,
+    foreign_text,
+    read_foreign,
+    write_foreign,
+)
 from service.sources.plant_formats.soltrace import SolTraceInput, parse_soltrace, read_soltrace
 from tests.service.command import ends, heliotwin
 from tests.service.sources.plant_files import ps10, published, round_c, write_plant
@@ -65,6 +70,7 @@ def test_soltrace_returns_as_it_came(tmp_path: Path, name: str, count: int):
     np.testing.assert_allclose(middles[1], middles[0], atol=1e-3)
 
 
+@pytest.mark.full
 def test_aim_points_of_soltrace_are_on_its_receiver(tmp_path: Path):
     imported = read_soltrace(published() / "soltrace" / AFTERNOON)
     points = np.array(list(imported.aims.values()))
@@ -154,6 +160,32 @@ def test_solarpilot_returns_as_it_came(tmp_path: Path):
     for entry in imported.heliostats:
         foot = plant.heliostats[entry.name].position
         np.testing.assert_allclose([entry.east_m, entry.north_m, entry.up_m], foot, atol=1e-6)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 30))
+def test_any_layout_returns_from_solarpilot(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, count: int
+):
+    """Places and aims to the micrometre that the format has, and types by their order."""
+    rng, folder = np.random.default_rng(seed), tmp_path_factory.mktemp("layout")
+    places = np.round(rng.uniform((-500, 50, -20), (500, 900, 20), (count, 3)), 3)
+    kinds = rng.choice(["large", "small"], count)
+    rows = [
+        f"H{n},{k},{x},{y},{z}\n"
+        for n, (k, (x, y, z)) in enumerate(zip(kinds, places.tolist(), strict=True))
+    ]
+    path = write_plant(folder, layout="".join(["name,type,east_m,north_m,up_m\n", *rows]))
+    aims = {f"H{n}": rng.uniform(-5, 5, 3) + (0, 0, 150) for n in range(count)}
+    out = folder / "layout.csv.out.csv"
+    write_foreign(read_plant(path), "solarpilot", out, ExportOptions(aims=dict(aims)))
+    imported = read_foreign(out)
+    assert [one.name for one in imported.heliostats] == [f"H{n + 1}" for n in range(count)]
+    found = [(one.east_m, one.north_m, one.up_m) for one in imported.heliostats]
+    np.testing.assert_allclose(found, places, atol=1e-6)
+    np.testing.assert_allclose(list(imported.aims.values()), list(aims.values()), atol=1e-6)
+    alike = {(kind, one.type) for kind, one in zip(kinds, imported.heliostats, strict=True)}
+    assert len(alike) == len(set(kinds))
 
 
 def test_facets_of_any_type_are_written_for_soltrace(tmp_path: Path):

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import solarpilot
+from heliotwin.field import FieldRequest, trace_field
 from service.base.progress import no_progress
-from service.cli.field import FieldRequest, trace_field
 
 pytest.importorskip("PySAM", reason="NREL-PySAM is not installed; see the extra 'peers'")
 

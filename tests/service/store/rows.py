@@ -66,16 +66,4 @@ def fill(database: Database, count: int) -> list[str]:
 
 
 def _forecast(heliostat: HeliostatRow, surface: SurfaceRow) -> ForecastRow:
-    numbers = ("sun_azimuth_deg", "sun_elevation_deg", "dni_w_m2", "peak_w_m2", "power_w")
-    return ForecastRow(
-        heliostat_id=heliostat.id,
-        surface_id=surface.id,
-        plane={},
-        normalised=False,
-        rows=8,
-        columns=8,
-        model_version="1:none",
-        flux=b"",
-        losses={},
-        **dict.fromkeys(numbers, 1.0),
-    )
+    return ForecastRow(heliostat_id=heliostat.id, surface_id=surface.id, document={}, flux=b"")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from heliotwin.cli.main import main
 from service.base.settings import Settings
-from service.cli.main import main
 from service.store.database import migrate
 from service.web.app import create_app
 from tests.service.conftest import FakeOperations, client_of

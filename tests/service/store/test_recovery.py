@@ -13,10 +13,10 @@ import pytest
 from sqlalchemy import select, update
 from typer.testing import CliRunner
 
+from heliotwin.cli.main import app as cli
 from model.errors import InvalidInputError
 from service.base.errors import ConflictError
 from service.base.settings import Settings
-from service.cli.main import app as cli
 from service.store.columns import Base
 from service.store.database import Database
 from service.store.job_tables import JobRow, JobStepRow

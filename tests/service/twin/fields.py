@@ -6,10 +6,10 @@ import numpy as np
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from heliotwin.demo.plant import ORIGIN, TARGET, properties
 from model.plant import Heliostat, Plant
 from model.surface import control_points
 from service import store
-from service.cli.demo_plant import ORIGIN, TARGET, properties
 from service.store.database import Database
 from service.store.surfaces.surface_versions import NewSurface
 from service.twin.runtime.runtime import Runtime

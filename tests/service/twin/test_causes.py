@@ -101,6 +101,7 @@ def test_wrong_clock_is_the_first_cause(stj: Path, years: Path, tmp_path: Path):
     assert "Correct time or sun" in first
 
 
+@pytest.mark.full
 def test_few_suns(stj: Path, years: Path, tmp_path: Path):
     lay_out(stj, tmp_path / "import" / "plant")
     shutil.rmtree(tmp_path / "import" / "plant" / "AA39" / "Deflectometry")

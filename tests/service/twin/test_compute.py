@@ -41,6 +41,7 @@ LIGHTS: list[tuple[SunShape, list[dict[str, Any]]]] = [
 """Suns that are declared, and effects of the sun, the mirror and the camera."""
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("window", [None, 5.0, 30.0])
 @pytest.mark.parametrize("sun", [(-30.0, 40.0), (80.0, 12.0), (0.0, 62.0)])
 @pytest.mark.parametrize("distance", [40.0, 120.0, 350.0])

@@ -11,10 +11,12 @@ from service import store
 from service.base.errors import ConflictError
 from service.base.settings import Settings
 from service.store.database import Database
+from service.store.pointing.mounts import CalibrationState
 from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import HeliostatStateRow
+from service.twin.pointing.calibration import _reason
 from service.twin.surfaces.epochs import (
     FALL,
     AccuracyFall,
@@ -100,6 +102,9 @@ def test_too_few_photographs_are_asked_for(database: Database):
     assert found is not None
     with database.reading() as session:  # the calibration plan proposes it
         assert waiting_epochs(session, SETTINGS) == {"AA39": found}
+    said = _reason(CalibrationState("AA39", 0, None), found)
+    assert said.startswith("its accuracy by one surface fell between")
+    assert said.endswith("more needed")
     with pytest.raises(ConflictError, match="3 photographs since, 2 more needed"):
         _begin_of_epoch("AA39", found)
 

@@ -340,6 +340,7 @@ def test_what_an_export_leaves_out_is_documented():
     assert [name for name in measured if f"`{name}`" not in section] == []
 
 
+@pytest.mark.full
 def test_mount_of_undated_photographs_goes_through_an_export(
     client: TestClient, tower: Any, properties: Any, tmp_path: Path
 ):

@@ -3,6 +3,7 @@ again.
 """
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -35,7 +36,18 @@ from service.twin.plant import model_versions
 from service.twin.runtime.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
-from tests.service.conftest import QUIET, FakeOperations, png, poster, spot_of, sun_at
+from service.web.app import create_app
+from tests.conftest import made_once
+from tests.service.conftest import (
+    QUIET,
+    FakeOperations,
+    client_of,
+    png,
+    poster,
+    spot_of,
+    sun_at,
+    tower_document,
+)
 from tests.service.exported import require_same
 from tests.service.exported import rows_of as exported_rows
 from tests.service.studies import SLOPE, study_row
@@ -74,8 +86,7 @@ def mount_document(moment: str) -> dict[str, Any]:
     }
 
 
-@pytest.fixture
-def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
+def fill(client: TestClient, tower: dict[str, Any]) -> None:
     """Photographs with all that is known of them, a measured surface and a predicted one, a
     receiver, a model.
     """
@@ -136,7 +147,25 @@ def filled(client: TestClient, tower: dict[str, Any]) -> TestClient:
         row = store.get_heliostat(session, "AA39")
         add_mount(session, row, mount_document("2024-06-03T11:30:00+00:00"))
         store.get_measurement(session, row, "1").forecast_accuracy = 0.875
-    return client
+
+
+@pytest.fixture(scope="session")
+def filled_store(known_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data of a service that knows all that an export holds; copy it."""
+
+    def make(root: Path) -> None:
+        shutil.copytree(known_store, root, dirs_exist_ok=True)
+        with client_of(create_app(Settings(data_dir=root, **QUIET), FakeOperations())) as client:
+            fill(client, tower_document())
+
+    return made_once(tmp_path_factory, "filled-store", make)
+
+
+@pytest.fixture
+def filled(settings: Settings, app: FastAPI, filled_store: Path) -> Iterator[TestClient]:
+    shutil.copytree(filled_store, settings.data_dir, dirs_exist_ok=True)
+    with client_of(app) as client:
+        yield client
 
 
 def measured_points(client: TestClient, z: Any) -> Any:
@@ -338,6 +367,7 @@ def _verdict(document: dict[str, Any]) -> None:
     document["studies"][0]["verdict"] = "perhaps"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("spoil", [_model, _declared, _found, _verdict])
 def test_a_model_that_could_not_be_computed_with_is_not_brought_back(
     exported: tuple[Path, dict[str, Any]], other: Runtime, spoil: Callable[[dict[str, Any]], None]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from heliotwin.demo.plant import TARGET
 from model.fleet import Superposition
 from model.frames import sun_direction
-from service.cli.demo_plant import TARGET
 from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker
 from service.sources.documents import read_receivers
@@ -34,7 +34,9 @@ def fleet(client: TestClient, **changes: Any) -> tuple[dict[str, Any], np.ndarra
 
 
 def alone(client: TestClient, name: str, **changes: Any) -> np.ndarray:
-    answer = client.post("/v1/forecasts", json={"heliostat": name} | FLEET | changes)
+    answer = client.post(
+        "/v1/forecasts", json={"heliostat": name, "measured_states": False} | FLEET | changes
+    )
     assert answer.status_code == 201, answer.text
     return np.array(client.get(answer.headers["Location"]).json()["flux"])
 
@@ -106,7 +108,7 @@ def test_one_heliostat_is_forecast_on_a_cylinder(field: TestClient):
     flux = alone(field, "B00", target="ring")
     np.testing.assert_array_equal(flux, expected)
     np.testing.assert_array_equal(alone(field, "B00", target=None, receiver=cylinder), flux)
-    body = {"heliostat": "B00", **FLEET, "target": "ring"}
+    body = {"heliostat": "B00", **FLEET, "target": "ring", "measured_states": False}
     made = field.post("/v1/forecasts", json=body).json()
     assert made["plane"]["radius"] == 2.5
     assert made["plane"]["width"] == pytest.approx(2.5 * np.pi)
@@ -119,6 +121,7 @@ def test_one_heliostat_is_forecast_on_a_cylinder(field: TestClient):
     assert "the cylinder is unrolled" in page
 
 
+@pytest.mark.full
 def test_field_forecast_that_is_begun_again_goes_on_from_its_checkpoint(
     field: TestClient, monkeypatch: pytest.MonkeyPatch
 ):

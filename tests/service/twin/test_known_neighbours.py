@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from heliotwin.folder_store import open_folder
 from model.frames import sun_direction
 from model.setup import Setup
 from model.study import FluxImage
 from model.surface import control_points
-from service.cli.folder_store import open_folder
 from service.sources.folder import read_folder
 from service.twin.studies.known_neighbours import load_neighbours, with_neighbours
 from tests.service.sources.plant_files import PLANT, write_plant

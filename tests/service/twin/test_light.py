@@ -46,6 +46,7 @@ def test_a_soiled_mirror_is_found_with_its_day_and_share(share: float):
         changed = FIRST + timedelta(days=14)
         assert found.before < changed <= found.since
         assert found.since - found.before <= timedelta(days=4)
+        assert 4 <= found.photographs <= 7
 
 
 def test_haze_and_noise_raise_nothing():

@@ -166,6 +166,7 @@ def test_the_warning_holds_until_sun_or_target_change(
     assert client.get("/v1/alarms?reason=unlike_heliostat").json()["items"] == []
 
 
+@pytest.mark.full
 def test_a_heliostat_that_is_usually_forecast_badly_is_not_warned_of(
     field_of_twelve: TestClient, fitting: Likenesses
 ):

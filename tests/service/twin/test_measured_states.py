@@ -10,6 +10,7 @@ import pytest
 from model.errors import InvalidInputError
 from model.plant import Heliostat, MirrorOptics
 from service.twin.alarms.measured_states import predicted_pointing_error
+from service.twin.forecasts.aim_sources import has_other_state
 from service.twin.forecasts.mirror_states import (
     AS_DECLARED,
     STATE_COLUMNS,
@@ -105,3 +106,29 @@ def test_too_few_photographs_predict_nothing():
     huge = predicted_pointing_error(pointing(500.0, 2, 2))
     assert huge is not None
     assert huge.value < 100
+
+
+@pytest.mark.parametrize(
+    ("name", "cleanliness", "pointing_mrad", "is_other"),
+    [
+        ("A1", None, None, True),  # dimmed since
+        ("A1", 0.55, None, False),
+        ("A1", 0.9, None, True),
+        ("A3", 0.5, None, True),  # cleaned since: its flux may exceed the limit
+        ("A2", None, 6.0, False),
+        ("A2", None, 2.0, True),
+        ("A2", None, 20.0, False),  # it points better than was assumed
+        ("A3", None, None, False),
+    ],
+)
+def test_plans_are_outdated_by_other_states(
+    name: str, cleanliness: float | None, pointing_mrad: float | None, is_other: bool
+):
+    assert has_other_state(MEASURED, name, cleanliness, pointing_mrad) is is_other
+
+
+def test_measured_values_of_a_heliostat_in_words():
+    assert MEASURED.in_words("A1") == ["as photographs measured, its cleanliness 0.56 counts"]
+    (said,) = MEASURED.in_words("A2")
+    assert said == "as photographs measured, its pointing error 7.50 mrad counts"
+    assert MEASURED.in_words("A3") == []

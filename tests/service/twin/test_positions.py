@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from typer.testing import CliRunner
 
+from heliotwin.cli.main import app as cli
+from heliotwin.folder_pointing import calibrate_folder
 from service import store
 from service.base.settings import Settings
-from service.cli.folder_pointing import calibrate_folder
-from service.cli.main import app as cli
 from service.sources.folder import read_folder
 from service.store.database import Database
 from service.store.pointing import mounts
@@ -101,6 +101,7 @@ def test_mounts_of_the_store_are_those_of_the_folder(
         assert {*of_store.done.contradictions[name]} == {*of_folder["heliostats"][name]["outliers"]}
 
 
+@pytest.mark.full
 def test_they_go_through_export_and_back_up(
     stored: tuple[Settings, dict[str, Any]], tmp_path: Path
 ):
@@ -137,6 +138,7 @@ def test_they_go_through_export_and_back_up(
     database.close()
 
 
+@pytest.mark.full
 def test_what_is_skipped_is_counted_by_reason(
     positions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -16,6 +16,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL, select
 
+from heliotwin.demo.plant import ORIGIN, TARGET, properties
 from model.effects.camera_response import CameraResponse
 from model.forecast import View, align
 from model.frames import sun_angles, sun_direction
@@ -28,7 +29,6 @@ from model.surface import control_points
 from service import store
 from service.base.arrays import pack, unpack
 from service.base.settings import Settings
-from service.cli.demo_plant import ORIGIN, TARGET, properties
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
@@ -166,7 +166,7 @@ def forecast(client: TestClient, **changes: Any) -> tuple[str, np.ndarray]:
 
 
 def test_effect_is_found_adopted_used_and_withdrawn(looped: TestClient):
-    result = done(looped, "/v1/studies", candidates=["camera_response", "camera_blur"])
+    result = done(looped, "/v1/jobs/studies", candidates=["camera_response", "camera_blur"])
     assert result["verdict"] == "effect"
     path = f"/v1/studies/{result['study']}"
     study = looped.get(path).json()
@@ -209,9 +209,10 @@ def test_effect_is_found_adopted_used_and_withdrawn(looped: TestClient):
     np.testing.assert_array_equal(withdrawn, photographed)
 
 
+@pytest.mark.full
 def test_study_that_knows_the_effect_finds_no_more(looped: TestClient):
     candidates = ["camera_response", "camera_blur"]
-    first = done(looped, "/v1/studies", candidates=candidates)["study"]
+    first = done(looped, "/v1/jobs/studies", candidates=candidates)["study"]
     looped.post(f"/v1/studies/{first}/adopt", json={})
     second = done(looped, "/v1/jobs/studies", candidates=candidates)
     assert second["verdict"] == "none"
@@ -369,7 +370,7 @@ def test_centred_flux_needs_a_spot_on_its_target(
 
 
 def test_too_few_photographs_end_the_job_with_the_reasons(client: TestClient):
-    answer = client.post("/v1/studies", json={})
+    answer = client.post("/v1/jobs/studies", json={})
     runtime = cast(FastAPI, client.app).state.runtime
     Worker(runtime, KINDS, "tester", threading.Event()).work()
     job = client.get(answer.headers["Location"]).json()
@@ -388,7 +389,6 @@ def test_too_few_photographs_end_the_job_with_the_reasons(client: TestClient):
     ],
 )
 def test_malformed_request_is_refused(refusing: TestClient, payload: dict[str, Any]):
-    for path in ("/v1/studies", "/v1/jobs/studies"):
-        answer = refusing.post(path, json=payload)
-        assert answer.status_code == 422
-        assert next(iter(payload)) in answer.json()["detail"]
+    answer = refusing.post("/v1/jobs/studies", json=payload)
+    assert answer.status_code == 422
+    assert next(iter(payload)) in answer.json()["detail"]

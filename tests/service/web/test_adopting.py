@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli.main import app as command
+from heliotwin.cli.main import app as command
 from service.store import outdated_surfaces
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.studies import SLOPE, report_of

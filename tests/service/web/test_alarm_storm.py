@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from heliotwin.demo.field import write_layout
 from service.base.settings import Settings
-from service.cli.demo_field import write_layout
 from service.sources.folder import read_folder
 from service.twin.alarms.alarms import Alarm
 from service.twin.alarms.common_causes import find_bursts
@@ -84,6 +84,7 @@ def test_bursts_are_more_than_the_usual_number():
     assert len(find_bursts(alarms(*together, *(day + 40 for day in together)))) == 2
 
 
+@pytest.mark.full
 def test_evidence_of_what_photographs_have_in_common(tmp_path: Path):
     """All that were photographed in a windy hour are forecast poorly."""
     app = create_app(Settings(data_dir=tmp_path, **QUIET), Blind())

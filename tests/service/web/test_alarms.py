@@ -3,9 +3,11 @@ as metrics.
 """
 
 import itertools
+import json
 import re
 from collections.abc import Iterator
 from datetime import UTC, date, datetime, timedelta
+from html import unescape
 from pathlib import Path
 from typing import Any, get_args
 
@@ -203,10 +205,11 @@ def test_accuracy_that_fell_above_the_least(tmp_path: Path):
         (first, *_) = re.findall(r"<strong>(.*?)</strong>.*?: (.*)", page[page.index("causes") :])
         assert first[0] == "The mirror changed"
         assert re.search(r"from 9\d\.\d% to 81\.\d%.*; \d photographs since show it", first[1])
-        (since,) = re.findall(r'name="since" value="(.*?)"', page)
+        (offer, *_) = re.findall(r'name="offer" value="(.*?)"', page)
+        since = json.loads(unescape(offer))["body"]["since"]
         assert datetime.fromisoformat(since) == datetime.fromisoformat(item["since"])
-        form = {"heliostat": "AA39", "since": since}
-        job = client.post("/jobs/predictions", data=form, headers=HTML, follow_redirects=False)
+        form = {"offer": unescape(offer)}
+        job = client.post("/offers", data=form, headers=HTML, follow_redirects=False)
         payload = client.get(f"/v1{job.headers['location']}").json()["payload"]
         assert datetime.fromisoformat(payload["since"]) == datetime.fromisoformat(since)
         # A photograph that was excluded says nothing of the mirror.
@@ -263,6 +266,7 @@ def calibrating(tmp_path: Path) -> Iterator[TestClient]:
         yield client
 
 
+@pytest.mark.full
 def test_moves_and_pointing_errors(calibrating: TestClient):
     client, post = calibrating, poster(calibrating)
     taken = photographs(tower_document(), properties_document(), step_mrad=25.0)
@@ -281,6 +285,7 @@ def test_moves_and_pointing_errors(calibrating: TestClient):
     assert of(client, "moved") == []  # calibrated, and more than 90 days ago
 
 
+@pytest.mark.full
 def test_pointing_error_beyond_the_bound(calibrating: TestClient):
     client, post = calibrating, poster(calibrating)
     taken = photographs(tower_document(), properties_document())

@@ -58,6 +58,7 @@ def test_target_and_receiver_never_have_one_name(both: TestClient):
         assert sorted(answer.status_code for answer in answers) == [201, 409]
 
 
+@pytest.mark.full
 def test_plants_in_opposite_orders_do_not_wait_for_each_other(
     both: TestClient, tower: dict[str, Any]
 ):

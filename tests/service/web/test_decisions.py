@@ -17,6 +17,7 @@ from model.observation import Observation, SurfacePrediction
 from model.plant import Heliostat
 from service import store
 from service.base.settings import Settings
+from service.twin.surfaces.prediction import import_surface
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (
@@ -122,6 +123,7 @@ def test_better_surface_becomes_active_and_is_undone(client: TestClient):
     assert client.get(f"{BASE}/2").json()["is_candidate"] is False
 
 
+@pytest.mark.full
 def test_undo_is_of_the_last_decision_that_changed_the_active_surface(
     client: TestClient, mirrors: Mirrors
 ):
@@ -318,6 +320,7 @@ def test_photographs_are_excluded_with_a_reason_and_used_again(
 ):
     mirrors.warnings = ("photograph 2 is not explained",)
     predict(client, "network")
+    client.get("/v1/alarms")  # the state of the field is written
     page = Page(page_of(client, "/heliostats/AA39"))
     sent = {"photographs": ["1", "2"], "reason": "a cloud"}
     path = "/heliostats/AA39/exclusions"
@@ -360,3 +363,39 @@ def test_candidate_is_kept_or_promoted_with_a_reason(client: TestClient):
     assert current(client) == 2
     assert client.post(f"{path}/keep", data=reason).status_code == 409
     assert "Undo: back to version 1" in page_of(client, "/heliostats/AA39")
+
+
+def test_choosing_by_hand_has_the_figures_of_the_last_comparison(client: TestClient):
+    """Fewer than five photographs are unseen, so parts of the surfaces judged each other."""
+    predict(client, "refined")
+    predict(client, "network")
+    (judged,) = client.get(f"{BASE}/decisions").json()["items"]
+    names = ("accuracy_before", "accuracy_after", "photographs")
+    headers = {"If-Match": client.get(f"{BASE}/current").headers["ETag"]}
+    for version, sign in ((2, 1), (1, -1)):
+        chosen = client.put(
+            f"{BASE}/current", json={"version": version, "reason": "to try"}, headers=headers
+        ).json()
+        assert [chosen[name] for name in names] == [
+            *(judged[name] for name in names[:2][::sign]),
+            judged["photographs"],
+        ]
+        headers = {"If-Match": client.get(f"{BASE}/current").headers["ETag"]}
+
+
+def test_imported_surface_is_judged_by_photographs(client: TestClient):
+    """It forecasts worse than the active one on five photographs that neither has seen."""
+    runtime = client.app.state.runtime  # type: ignore[attr-defined]
+    photograph(client, 3, 4, 5, 6, 7)
+    predict(client, "network")
+    for bend, is_candidate in ((15e-3, True), (1e-3, False)):
+        z = np.full((4, 8, 8), bend)
+        new = store.NewSurface("measured", z, 0 * z, np.full((4, 8, 8, 3), bend))
+        assert import_surface(runtime, "AA39", new, "tester")
+        assert not import_surface(runtime, "AA39", new, "tester")
+        newest = client.get(BASE).json()["items"][-1]
+        assert (newest["source"], newest["is_candidate"]) == ("measured", is_candidate)
+    decisions = client.get(f"{BASE}/decisions").json()["items"]
+    assert [one["became_active"] for one in decisions] == [True, False]
+    assert all("on 5 photographs that neither has seen" in one["reason"] for one in decisions)
+    assert current(client) == 3

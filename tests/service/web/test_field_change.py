@@ -1,20 +1,30 @@
 """A study is adopted for what comes: later photographs judge it, and end an effect."""
 
+import json
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from typer.testing import CliRunner
 
+from heliotwin.cli.main import app as command
 from model.effects import acting
 from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
+from service.base.errors import ConflictError
 from service.store.tables import StudyRow
+from service.twin.plant.model_versions import get_model, model_if_adopted
+from service.twin.runtime.runtime import Runtime
+from service.twin.studies.field_change import EffectGains, sample_photographs
 from tests.service.conftest import FakeOperations, png, poster, until
-from tests.service.studies import SLOPE
+from tests.service.statements import statements
+from tests.service.studies import SLOPE, report_of
 from tests.service.web.pages import HTML, keep_study
 
 FIRST = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -65,10 +75,10 @@ def keep(app: FastAPI, *effects: dict[str, Any]) -> str:
     return f"/v1/studies/{number}"
 
 
-def alarms(client: TestClient) -> list[dict[str, Any]]:
+def alarms(client: TestClient, reason: str = "effect_ended") -> list[dict[str, Any]]:
     until(lambda: client.get("/v1/alarms").json()["pending"] == 0)
     items: list[dict[str, Any]] = client.get("/v1/alarms").json()["items"]
-    return [one for one in items if one["reason"] == "effect_ended"]
+    return [one for one in items if one["reason"] == reason]
 
 
 def change_page(client: TestClient) -> str:
@@ -118,6 +128,7 @@ def test_adopted_effect_that_ended_raises_an_alarm_until_it_gets_its_end(
     assert alarm["action"] == "end it by 2026-06-07, see /studies/1/change"
     change = change_page(hazy)
     assert "End slope error by 2026-06-07" in change
+    assert alarm["offer"]["body"] == {"until": {"slope_error": "2026-06-07"}}
     form = {"ended": "slope_error 2026-06-07", "current": "2"}
     assert hazy.post("/studies/1/adopt", data=form, follow_redirects=False).status_code == 303
     assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
@@ -125,6 +136,55 @@ def test_adopted_effect_that_ended_raises_an_alarm_until_it_gets_its_end(
     assert "End slope error" not in change_page(hazy)
     gain = hazy.get("/v1/studies/1/change").json()["whole"]["mean"]
     assert gain == pytest.approx(6 * 0.1 / 12, abs=0.001)
+
+
+def test_a_study_that_helps_is_offered_with_its_end(app: FastAPI, hazy: TestClient):
+    keep(app, SLOPE | {"scope": SINCE})
+    (alarm,) = alarms(hazy, "study_undecided")
+    assert "with its effects the accuracy changes by +5.0 points on 12 photo" in alarm["message"]
+    offer = alarm["offer"]
+    assert offer["label"] == "Adopt study 1, ended by 2026-06-07"
+    assert hazy.request(offer["method"], offer["path"], json=offer["body"]).status_code == 201
+    assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
+    assert (alarms(hazy, "study_undecided"), alarms(hazy)) == ([], [])
+
+
+def test_an_effect_that_never_acted_is_withdrawn(app: FastAPI, hazy: TestClient):
+    study = keep(app, SLOPE | {"scope": SINCE | {"since": "2026-06-07"}})
+    forced = {"force": True, "reason": "it is so"}
+    assert hazy.post(f"{study}/adopt", json=forced).status_code == 201
+    (alarm,) = alarms(hazy)
+    offer = alarm["offer"]
+    assert offer["path"] == f"{study}/withdraw"
+    assert hazy.request(offer["method"], offer["path"], json=offer["body"]).status_code == 200
+    assert (effects(hazy), alarms(hazy)) == ([], [])
+    assert alarms(hazy, "study_undecided") == []  # a person decided
+
+
+def test_photographs_are_chosen_by_one_query(app: FastAPI, hazy: TestClient):
+    runtime: Runtime = app.state.runtime
+    with runtime.database.reading() as session, statements(runtime.database) as sent:
+        found = sample_photographs(session)
+    assert len(sent) <= 2  # the other one reads active surfaces
+    assert [one.taken_at.date() for one in found] == [
+        (FIRST + timedelta(days=day)).date() for day in reversed(range(DAYS))
+    ]
+
+
+def test_gains_are_computed_again_for_another_version_of_the_model(app: FastAPI, hazy: TestClient):
+    """Another version may declare another camera, which measures photographs again."""
+    runtime: Runtime = app.state.runtime
+    number = keep_study(app, SLOPE | {"scope": SINCE})
+    gains = EffectGains(runtime)
+    with runtime.database.reading() as session:
+        before, sampled = get_model(session), sample_photographs(session)
+        after = model_if_adopted(session, session.get_one(StudyRow, number))
+    first = gains.of(sampled, before, after)
+    with statements(runtime.database) as sent:
+        assert gains.of(sampled, before, after) == first
+        assert sent == []
+        assert gains.of(sampled, replace(before, number=before.number + 1), after) == first
+        assert sent != []
 
 
 def test_page_of_the_change_offers_the_end_first(app: FastAPI, hazy: TestClient):
@@ -162,3 +222,35 @@ def test_what_nobody_contradicts_is_adopted(app: FastAPI, hazy: TestClient):
     assert hazy.post(f"{study}/adopt", json={}).status_code == 201
     assert np.isclose(hazy.get(f"{study}/change").json()["whole"]["mean"], 6 * 0.1 / 12, atol=0.001)
     assert alarms(hazy) == []
+
+
+def test_effect_by_day_gets_an_end_on_other_days(app: FastAPI, hazy: TestClient):
+    by_day = {"2026-06-02": 0.4, "2026-06-03": 0.6}
+    value = SLOPE["parameters"]["sigma_mrad"] | {"by_day": by_day}
+    effect = SLOPE | {"scope": {"kind": "day"}, "parameters": {"sigma_mrad": value}}
+    study = keep(app, effect)
+    (found,) = hazy.get(f"{study}/change").json()["contradicted"]
+    assert (found["until"], found["can_end"]) == ("2026-06-07", True)
+    done = hazy.post(f"{study}/adopt", json={"until": {found["effect"]: found["until"]}})
+    assert done.json()["effects"][0]["scope"] == {"kind": "day", "until": "2026-06-07"}
+
+
+def test_command_line_asks_later_photographs_too(
+    app: FastAPI, hazy: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(app.state.runtime.settings.data_dir))
+    monkeypatch.setattr(Runtime, "from_settings", lambda settings: app.state.runtime)
+    monkeypatch.setattr(Runtime, "close", lambda runtime: None)
+    document = report_of(SLOPE | {"scope": SINCE}, verdict="effect")
+    seen = {f"AA39/{100 + day}": 0.9 for day in range(5)}
+    document |= {"known_effects": [], "before": document["before"] | {"per_image": seen}}
+    report = tmp_path / "report.json"
+    report.write_text(json.dumps(document), encoding="utf-8")
+    refused = CliRunner().invoke(command, ["models", "adopt", str(report), "--force"])
+    assert isinstance(refused.exception, ConflictError)
+    assert "this report: accuracy changes by" in str(refused.exception)
+    assert "force it and give the reason" in str(refused.exception)
+    assert effects(hazy) == []
+    forced = ["models", "adopt", str(report), "--force", "--reason", "it returns"]
+    assert CliRunner().invoke(command, forced).exit_code == 0
+    assert len(effects(hazy)) == 1

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from heliotwin.field import FieldRequest, trace_field
 from model.fleet import LOSSES
-from service.cli.field import FieldRequest, trace_field
 from service.sources.folder import read_folder
 from service.sources.plant_file import PlantDescription, read_plant
 from service.twin.transfer.importing import import_folder
@@ -131,7 +131,7 @@ def test_single_forecast_has_the_losses_of_the_same_field_forecast(rich: TestCli
     table = rich.get(f"/forecasts/{made['id']}?table=losses", headers=HTML)
     lines = list(csv.DictReader(io.StringIO(table.text)))
     assert [line["Stage"] for line in lines] == ["on the mirrors' area", *LOSSES]
-    assert float(lines[-1]["Left [kW]"]) == pytest.approx(losses["absorbed_w"] / 1e3)
+    assert float(lines[-1]["Left [W]"]) == pytest.approx(losses["absorbed_w"])
 
 
 def test_losses_are_those_of_the_whole_plane_whatever_is_mapped(rich: TestClient):
@@ -162,7 +162,7 @@ def test_page_shows_the_chain_of_losses_and_each_heliostat(rich: TestClient):
     table = rich.get(f"/jobs/{number}?table=losses", headers=HTML)
     lines = list(csv.DictReader(io.StringIO(table.text)))
     assert [line["Stage"] for line in lines] == ["on the mirrors' area", *LOSSES]
-    assert float(lines[-1]["Left [kW]"]) == pytest.approx(field["absorbed_w"] / 1e3)
+    assert float(lines[-1]["Left [W]"]) == pytest.approx(field["absorbed_w"])
     by_factor = job["result"]["by_heliostat"]
     for factor in ("cosine", "intercept"):
         sorted_page = rich.get(f"/jobs/{number}?by={factor}", headers=HTML).text

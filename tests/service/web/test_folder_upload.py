@@ -310,7 +310,7 @@ from pathlib import Path
 from service.base.settings import Settings
 from service.jobs import uploads
 from service.twin.runtime.runtime import Runtime
-uploads._count = lambda path: print("unpacked", flush=True) or time.sleep(600)
+uploads._count = lambda *_: print("unpacked", flush=True) or time.sleep(600)
 runtime = Runtime.from_settings(Settings(data_dir=Path(sys.argv[1])), object())
 uploads.receive_upload(runtime, open(sys.argv[2], "rb"), "plant.zip", "tester")
 """
@@ -354,4 +354,16 @@ def test_left_overs_are_deleted_unless_a_process_works_on_them(
         delete_unused_uploads(real.runtime_of(client))
         assert [path.name for path in _stored(settings)] == [".alive"]
     delete_unused_uploads(real.runtime_of(client))
+    assert _stored(settings) == []
+
+
+def test_a_folder_of_another_plant_is_refused_at_once(
+    client: TestClient, settings: Settings, folder: Path, tower: Any
+):
+    latitude, longitude, altitude = tower["power_plant_properties"]["coordinates"]
+    tower["power_plant_properties"]["coordinates"] = [latitude + 1, longitude, altitude]
+    (folder / "WRI1030197-tower-measurements.json").write_text(json.dumps(tower))
+    answer = _upload(client, zipped(folder), UPLOADS)
+    assert answer.status_code == 409, answer.text
+    assert "take another store for another plant" in answer.json()["detail"]
     assert _stored(settings) == []

@@ -67,9 +67,12 @@ def test_job_of_predictions_takes_the_time_of_refinement_without_a_network(
 ):
     other, juelich = real.runtime_of(rich), real.runtime_of(two_heliostats)
     without = PredictionsIn(heliostats=["A1", "A2", "B1"])
-    assert predictions.expected_s(without, other) == 3 * 60.0
-    assert predictions.expected_s(PredictionsIn(), juelich) == 2 * 0.5
-    assert predictions.expected_s(PredictionsIn(method="refined"), juelich) == 2 * 60.0
+    assert predictions.expected_s(without, other) == 3 * predictions.EACH_S["refined"]
+    assert predictions.expected_s(PredictionsIn(), juelich) == 2 * predictions.EACH_S["network"]
+    assert (
+        predictions.expected_s(PredictionsIn(method="refined"), juelich)
+        == 2 * predictions.EACH_S["refined"]
+    )
 
 
 def test_own_facets_and_canting_replace_those_of_the_type(rich: TestClient):
@@ -88,7 +91,7 @@ def test_own_facets_and_canting_replace_those_of_the_type(rich: TestClient):
         ({"receiver": "mian"}, "receiver", "did you mean main?"),
         ({"facets": {"file": "other.csv"}}, "facets.file", "rows and columns"),
         ({"canting": "individual"}, "canting", "facets file"),
-        ({"type": {**MIRROR, "reflectance": 2}}, "type.reflectance", "less than or equal to 1"),
+        ({"type": {**MIRROR, "reflectance": 2}}, "type.reflectance", "1 or less"),
         ({"type": {**MIRROR, "reflectence": 1}}, "reflectence", "did you mean reflectance?"),
         ({"north": 3}, "north", "did you mean north_m?"),
         ({"type": {**MIRROR, "mount": {"kind": "helio"}}}, "type.mount.kind", "pitch_roll"),

@@ -98,7 +98,10 @@ def test_every_page_has_alarms_first_search_and_a_banner(home: TestClient, path:
     assert (first["href"], first.words.split()[0]) == ("/alarms", "Alarms")
     forms = [form["action"] for form in page.all("form", role="search")]
     assert forms.count("/find") == (2 if status == 404 else 1)
-    assert "everybody on this machine" in page.one("aside", class_="banner").words
+    banner = page.one("aside", class_="banner").words
+    assert "everybody on this machine" in banner
+    store = home.app.state.runtime.settings.store  # type: ignore[attr-defined]
+    assert f"{store} heliotwin keys create NAME --role admin" in banner
 
 
 def test_menu_has_the_count_of_alarms_without_scripts(home: TestClient):

@@ -15,7 +15,7 @@ from starlette.types import Message
 from service.jobs.kinds import KINDS
 from service.web.auth import security
 from tests.service.access import all_routes
-from tests.service.conftest import Post, metadata, png, serving, sun_at
+from tests.service.conftest import Post, metadata, png, serving, sun_at, until
 from tests.service.web.problems import check
 from tests.service.web.promises import promise
 
@@ -54,7 +54,7 @@ BODIES: list[tuple[str, str, dict[str, Any]]] = [
     ("POST", "jobs/forecasts", FIELD),
     ("POST", "jobs/forecasts", {"receiver": RECEIVER, "sun": SUN, "model_version": 1}),
     ("POST", "jobs/predictions", {"images": 4, "model_version": 1}),
-    ("POST", "studies", {"images": 4, "max_heliostats": 3}),
+    ("POST", "jobs/studies", {"images": 4, "max_heliostats": 3}),
     ("POST", "heliostats/AA39/surfaces", {"images": 4, "model_version": 1}),
     ("PUT", "targets/new", {"plane": PLANE}),
     ("PUT", "receivers/new", RECEIVER),
@@ -87,7 +87,7 @@ def test_other_types_are_refused_as_numbers(
             assert answer.status_code == 422, (place, value)
 
 
-@promise('Numbers are JSON\'s numbers: `"45"` and `true` are refused.')
+@promise('Numbers are JSON\'s numbers: `"45"` is refused as a string, and so is `true`.')
 def test_other_types_are_refused_as_numbers_in_documents(
     refusing: TestClient, refused_post: Post, tower: Any, properties: Any
 ):
@@ -167,6 +167,7 @@ def filled(client: TestClient, post: Post) -> TestClient:
     client.post("/v1/forecasts", json=ONE)
     client.post("/v1/jobs/predictions", json={})
     client.post("/v1/jobs/1/cancel")
+    until(lambda: client.get("/v1/alarms").json()["pending"] == 0)
     return client
 
 

@@ -102,6 +102,7 @@ def test_predictions_make_one_version_each_and_name_what_they_skip(
     }
 
 
+@pytest.mark.full
 def test_surfaces_of_a_job_that_is_begun_again_are_not_made_again(
     client: TestClient,
     post: Post,
@@ -430,7 +431,12 @@ def test_idempotency_key_is_kept_over_http(client: TestClient):
     first = client.post("/v1/jobs/squares", json={"value": 2}, headers=headers)
     again = client.post("/v1/jobs/squares", json={"value": 2}, headers=headers)
     assert first.headers["Location"] == again.headers["Location"]
-    assert client.post("/v1/jobs/squares", json={"value": 3}, headers=headers).status_code == 422
+    assert "Idempotency-Replayed" not in first.headers
+    assert again.headers["Idempotency-Replayed"] == "true"
+    other = client.post("/v1/jobs/squares", json={"value": 3}, headers=headers)
+    assert other.status_code == 422
+    assert other.json()["type"] == "urn:heliotwin:problem:idempotency-key-reused"
+    assert other.json()["errors"][0]["field"] == "Idempotency-Key"
     assert (
         client.post("/v1/jobs/squares", json={}, headers={"Idempotency-Key": "a b"}).status_code
         == 422
@@ -524,7 +530,7 @@ def test_jobs_show_phase_counts_and_estimate_while_the_model_computes(
     steps.shown.clear()
     studied = client.post("/v1/jobs/studies", json={"candidates": ["sun_shape", "soiling"]})
     assert finish(client, studied)["reason"] == "enough"
-    assert steps.shown == [("fits, at most", done, 9, done > 0) for done in range(3)]
+    assert steps.shown == [("fits, at most", done, 11, done > 0) for done in range(3)]
 
 
 @pytest.mark.parametrize("kind", ["predictions", "studies", "forecasts"])

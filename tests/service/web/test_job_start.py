@@ -35,7 +35,7 @@ def test_predictions_show_their_cost_before_they_start(client: TestClient, post:
     post(png(1))
     page = text_of(client, "/jobs/start")
     text = page.one("section", id="predictions").words
-    assert "1 surface, about 60 s" in text.replace("\xa0", " ")
+    assert "1 surface, about 3 min" in text.replace("\xa0", " ")
     assert client.get("/v1/jobs").json()["items"] == []
     job = _started(client, "/jobs/predictions", method="refined", heliostat="")
     assert job["state"] == "done"
@@ -80,6 +80,7 @@ def test_an_unknown_heliostat_is_named(client: TestClient):
     assert "ZZ99" in answer.text
 
 
+@pytest.mark.full
 def test_a_calibration_shows_mounts_steps_outliers_and_why_it_skipped(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):

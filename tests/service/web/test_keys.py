@@ -65,6 +65,57 @@ def test_keys_differ_and_names_are_not_given_again(database: Database):
     assert len(made) == 3
 
 
+def test_keys_expire_and_their_sessions_too(database: Database, monkeypatch: pytest.MonkeyPatch):
+    with database.writing() as session:
+        key = keys.create(session, "a", "read", "tester", timedelta(hours=1))
+        row = keys.find(session, key)
+        assert row is not None
+        token = sessions.begin(session, row)
+    later = now() + timedelta(hours=1, seconds=1)
+    monkeypatch.setattr(sessions, "now", lambda: later)
+    with database.reading() as session:
+        assert (keys.find(session, key), sessions.find_key(session, token)) == (None, None)
+        assert not keys.any_valid(session)
+        assert keys.any_made(session)
+
+
+def test_rotation_has_two_valid_keys_at_once(database: Database, monkeypatch: pytest.MonkeyPatch):
+    with database.writing() as session:
+        former = keys.create(session, "a", "ingest", "tester", timedelta(days=90))
+        following = keys.rotate(session, "a", "tester", timedelta(days=7))
+        with pytest.raises(ConflictError, match="--former"):
+            keys.rotate(session, "a", "tester", timedelta(days=7))
+    with database.reading() as session:
+        rows = [keys.find(session, key) for key in (former, following)]
+        assert [(row.name, row.role) for row in rows if row is not None] == [("a", "ingest")] * 2
+    for days, valid in ((6, [True, True]), (8, [False, True]), (91, [False, False])):
+        later = now() + timedelta(days=days)
+        with monkeypatch.context() as patch, database.reading() as session:
+            patch.setattr(sessions, "now", lambda later=later: later)
+            assert [keys.find(session, key) is not None for key in (former, following)] == valid
+    with database.writing() as session:
+        keys.withdraw(session, "a", "tester")
+        assert not keys.any_valid(session)
+        with pytest.raises(NotFoundError):
+            keys.rotate(session, "a", "tester", timedelta())
+
+
+def test_the_last_use_of_a_key_is_kept_to_the_hour(app: FastAPI, client: TestClient):
+    client.headers.update(bearer(make_key(app, "reader", "read")))
+    database, used = app.state.runtime.database, []
+    for age in (timedelta(0), timedelta(minutes=50), timedelta(minutes=70)):
+        with database.writing() as session:
+            row = keys.list_keys(session)[0]
+            used.append(row.last_used_at)
+            row.last_used_at = row.last_used_at and row.last_used_at - age
+        assert client.get("/v1/heliostats").status_code == 200
+    with database.reading() as session:
+        last = keys.list_keys(session)[0].last_used_at
+    assert used[0] is None
+    assert used[1] - timedelta(minutes=50) == used[2]
+    assert last >= used[1]
+
+
 @pytest.mark.parametrize(
     ("name", "role"),
     [("../x", "read"), ("a b", "read"), ("", "read"), ("local", "read"), ("a", "root")],
@@ -504,6 +555,7 @@ def test_who_asks_too_often_has_to_wait(settings: Settings, operations: FakeOper
         assert guesses == [401, 401, 401, 429, 429]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "path", ["/login", "/session", "/logout", "/docs", "/openapi.json", "/static/app.css"]
 )
@@ -623,10 +675,19 @@ def test_keys_by_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("HELIOTWIN_DATA_DIR", str(tmp_path / "data"))
-    assert exit_code("keys", "create", "plant", "--role", "operate") == 0
-    key = capsys.readouterr().out.strip()
+    assert exit_code("keys", "create", "plant", "--role", "operate") == 2
+    said = capsys.readouterr().err
+    assert (str(tmp_path / "data") in said, "HELIOTWIN_DATA_DIR" in said) == (True, True)
+    assert not (tmp_path / "data").exists()  # a key never makes a store
+    assert exit_code("migrate") == 0
+    capsys.readouterr()
+    assert exit_code("keys", "create", "plant", "--role", "operate", "--days", "30") == 0
+    shown = capsys.readouterr()
+    assert shown.err.strip() == f"in the store of HELIOTWIN_DATA_DIR={tmp_path / 'data'}"
+    key = shown.out.strip()
     assert exit_code("keys", "list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
+    assert listed[0]["expires_at"] > listed[0]["created_at"]
     assert [(entry["name"], entry["role"], entry["withdrawn_at"]) for entry in listed] == [
         ("plant", "operate", None)
     ]
@@ -634,9 +695,15 @@ def test_keys_by_the_command_line(
     database = Database(Settings().database)
     with database.reading() as session:
         assert keys.find(session, key) is not None
-    assert exit_code("keys", "withdraw", "plant") == 0
+    assert exit_code("keys", "rotate", "plant", "--overlap-days", "1") == 0
+    following = capsys.readouterr().out.strip()
+    assert exit_code("keys", "withdraw", "plant", "--former") == 0
     with database.reading() as session:
         assert keys.find(session, key) is None
+        assert keys.find(session, following) is not None
+    assert exit_code("keys", "withdraw", "plant") == 0
+    with database.reading() as session:
+        assert keys.find(session, following) is None
     database.close()
     capsys.readouterr()
     assert exit_code("keys", "withdraw", "plant") == 1

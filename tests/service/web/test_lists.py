@@ -5,9 +5,14 @@ stored.
 from typing import Any, cast
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from model.fleet import LOSSES
+from service.store.job_tables import JobRow
+from tests.page import Page
 from tests.service.conftest import Post, png, properties_document
+from tests.service.web.pages import HTML
 
 JSON = "application/json"
 
@@ -68,6 +73,28 @@ def test_every_list_is_a_page(bare: TestClient):
         "measurements/{measurement}/corrections",
     ):
         assert f"/v1/heliostats/{{name}}/{name}" in pages
+
+
+@pytest.mark.parametrize("sort", [{"by": "name"}, {"by": "cosine"}])
+def test_the_heliostats_of_a_job_are_all_a_page_away(
+    bare: TestClient, app: FastAPI, sort: dict[str, str]
+):
+    """211 heliostats of a field forecast are three pages, and so are 211 skipped ones."""
+    names = [f"H{number:03d}" for number in range(211)]
+    factors = dict.fromkeys((*LOSSES, "optical_efficiency", "intercepted_w"), 0.5)
+    result = {"by_heliostat": dict.fromkeys(names, factors), "skipped": dict.fromkeys(names, "")}
+    job = JobRow(kind="forecasts", payload={}, state="done", created_by="tester", result=result)
+    with app.state.runtime.database.writing() as session:
+        session.add(job)
+    path, seen, skipped = f"/jobs/{job.id}?by={sort['by']}", list[str](), list[str]()
+    for number in (1, 2, 3):
+        page = Page(bare.get(path, headers=HTML).text)
+        assert f"Page {number} of 3" in page.words
+        seen += page.texts("th", scope="row")
+        skipped += page.texts("dt")
+        path = "".join(link["href"] for link in page.all("a", rel="next"))
+    assert (path, seen) == ("", names)
+    assert set(names) <= set(skipped)
 
 
 def test_lists_that_are_pages_have_no_more_than_a_page(real_client: TestClient):
@@ -201,6 +228,8 @@ def test_surfaces_are_filtered_by_time(client: TestClient, post: Post):
     path = "/v1/heliostats/AA39/surfaces"
     found = {item["version"]: item["valid_from"] for item in client.get(path).json()["items"]}
     assert len(found) > 1
+    # The newest photograph was of an earlier day.
+    assert names(client, path, "version", sort="version", order="down") == sorted(found)[::-1]
     for bound in sorted(found.values()):
         assert names(client, path, "version", since=bound) == [
             name for name, at in found.items() if at >= bound
@@ -246,7 +275,6 @@ SUN = {"azimuth_deg": 180.0, "elevation_deg": 45.0}
         ("jobs/calibrations", {}),
         ("jobs/measurements", {}),
         ("jobs/studies", {}),
-        ("studies", {}),
         ("jobs/forecasts", {"target": "lower", "sun": SUN}),
         ("jobs/plans", {"target": "lower"} | DAY),
     ],

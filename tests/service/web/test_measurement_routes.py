@@ -84,6 +84,9 @@ def test_refused_image_is_kept_with_its_reason(client: TestClient, post: Post):
     assert (body["accepted"], body["reason"]) == (False, "no_spot")
     assert body["quality"]["detail"] == "no spot was found"
     assert client.get(f"{BASE}/{body['id']}/image").content == image
+    octets = {"Accept": "application/octet-stream"}
+    answer = client.get(f"{BASE}/{body['id']}/image", headers=octets)
+    assert (answer.headers["Content-Type"], answer.content) == (octets["Accept"], image)
     flux = client.get(f"{BASE}/{body['id']}/flux")
     assert flux.status_code == 404
     assert "no_spot" in flux.json()["detail"]
@@ -178,19 +181,19 @@ def test_centered_image_has_no_place_on_the_target(client: TestClient, post: Pos
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"sun": sun_at(elevation_deg=91)}, "metadata.sun.elevation_deg"),
-        ({"sun": sun_at(elevation_deg=0)}, "metadata.sun.elevation_deg"),
-        ({"sun": sun_at("x")}, "metadata.sun.azimuth_deg"),
-        ({"kind": "photo"}, "metadata.kind"),
-        ({"target": "../x"}, "metadata.target"),
-        ({"id": "a/b"}, "metadata.id"),
-        ({"taken_at": "2024-05-01T10:00:00"}, "metadata.taken_at"),
-        ({"motor_position": [1]}, "metadata.motor_position"),
-        ({"motor_position": {"axis_1_motor_position": 1}}, "metadata.motor_position"),
-        ({"focal_spot_m": [1, 2]}, "metadata.focal_spot_m"),
-        ({"focal_spot": [1, 2, 3]}, "metadata.focal_spot"),
-        ({"corners": [[0, 0]] * 3}, "metadata.corners"),
-        ({"typo": 1}, "metadata.typo"),
+        ({"sun": sun_at(elevation_deg=91)}, "sun.elevation_deg"),
+        ({"sun": sun_at(elevation_deg=0)}, "sun.elevation_deg"),
+        ({"sun": sun_at("x")}, "sun.azimuth_deg"),
+        ({"kind": "photo"}, "kind"),
+        ({"target": "../x"}, "target"),
+        ({"id": "a/b"}, "id"),
+        ({"taken_at": "2024-05-01T10:00:00"}, "taken_at"),
+        ({"motor_position": [1]}, "motor_position"),
+        ({"motor_position": {"axis_1_motor_position": 1}}, "motor_position"),
+        ({"focal_spot_m": [1, 2]}, "focal_spot_m"),
+        ({"focal_spot": [1, 2, 3]}, "focal_spot"),
+        ({"corners": [[0, 0]] * 3}, "corners"),
+        ({"typo": 1}, "typo"),
     ],
 )
 def test_wrong_metadata_is_named(refused_post: Post, changes: dict[str, Any], named: str):
@@ -263,6 +266,29 @@ def test_form_without_its_parts(refusing: TestClient):
         BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data"}
     )
     assert no_boundary.status_code in (400, 422)
+
+
+@pytest.mark.parametrize("part", ["image", "metadata"])
+def test_a_part_that_is_there_twice(client: TestClient, part: str):
+    parts = [("image", ("a.png", png(1))), ("metadata", (None, json.dumps(metadata())))]
+    parts.append(next(one for one in parts if one[0] == part))
+    answer = client.post(BASE, files=parts)
+    assert answer.status_code == 422
+    assert f"{part}: is there twice" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("end", ['"kind": "raw"}', '"sun": {"azimuth_deg": 1, "azimuth_deg": 2}}'])
+def test_a_key_of_metadata_that_is_there_twice(client: TestClient, end: str):
+    text = json.dumps(metadata())[:-1] + ", " + end
+    answer = client.post(BASE, files={"image": ("a.png", png(1))}, data={"metadata": text})
+    assert answer.status_code == 422
+    assert "is there twice; keep one" in answer.text
+
+
+def test_metadata_may_begin_with_a_byte_order_mark(client: TestClient):
+    text = b"\xef\xbb\xbf" + json.dumps(metadata()).encode()
+    files = {"image": ("a.png", png(1)), "metadata": ("m.json", text)}
+    assert client.post(BASE, files=files).status_code == 201
 
 
 # --- at the same time

@@ -8,12 +8,14 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from model.ephemeris import sun_angles_at
 from service.base.fields import plant_time_to_utc
 from service.base.settings import Settings
 from service.drawing.templates import form_time, times_in_zone
 from service.store.columns import now
 from service.web.app import create_app
 from tests.service.conftest import (
+    ORIGIN,
     QUIET,
     FakeOperations,
     client_of,
@@ -123,8 +125,11 @@ def test_now_and_noon_tomorrow_are_filled_in(madrid: TestClient):
     assert abs(datetime.fromisoformat(field_of(page, "moment")) - here) < timedelta(minutes=2)
     assert page.one("input", name="sun_by", value="time").attributes.keys() >= {"checked"}
     assert (field_of(page, "heliostat"), "target=upper" in first) == ("AB01", True)
-    noon = f"{here + timedelta(days=1):%Y-%m-%d} 12:00"
-    assert field_of(text_of(madrid, second), "moment") == noon
+    noon = field_of(text_of(madrid, second), "moment")
+    shown = datetime.fromisoformat(noon)
+    assert shown.date() == (here + timedelta(days=1)).date()
+    azimuth, _ = sun_angles_at(plant_time_to_utc(shown, ZONE), ORIGIN)
+    assert azimuth == pytest.approx(180, abs=0.5)
     plan = text_of(madrid, "/plans?when=noon")
     assert field_of(plan, "first_at") == field_of(plan, "last_at") == noon
 

@@ -61,6 +61,7 @@ def test_a_calibration_finds_mount_and_step(
     assert early.status_code == 404
 
 
+@pytest.mark.full
 def test_photographs_without_a_time_hide_no_step(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):
@@ -74,6 +75,7 @@ def test_photographs_without_a_time_hide_no_step(
     assert client.get("/v1/heliostats/AA39/pointing").json()["since_calibration"] == 0
 
 
+@pytest.mark.full
 def test_motors_send_the_light_to_the_aim(
     client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
 ):
@@ -98,6 +100,7 @@ def test_motors_send_the_light_to_the_aim(
     assert aimed["sun"]["elevation_deg"] > 55
 
 
+@pytest.mark.full
 def test_the_past_is_turned_by_the_drives_of_then(
     client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
 ):
@@ -169,6 +172,7 @@ def test_some_are_calibrated_by_the_prior_of_all(
     assert parameters["second_zero"]["prior_std"] < 0.8 * SPREAD[NAMES.index("second_zero")]
 
 
+@pytest.mark.full
 def test_all_forecasts_use_the_calibrated_mount(
     client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
 ):
@@ -210,6 +214,7 @@ def test_all_forecasts_use_the_calibrated_mount(
     assert not any(mount.is_calibrated for mount in mounts().values())
 
 
+@pytest.mark.full
 def test_photographs_newer_than_a_mount_say_to_a_study_where_motors_sent_the_light(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):
@@ -230,6 +235,7 @@ def test_photographs_newer_than_a_mount_say_to_a_study_where_motors_sent_the_lig
     assert all(p.spot_std_rad < 3e-3 and p.spot_shifts_rad is not None for p in known)
 
 
+@pytest.mark.full
 def test_mounts_hold_under_the_sun_they_were_calibrated_under(
     client: TestClient, post: Post, operations: FakeOperations, tower: Any, properties: Any
 ):
@@ -335,12 +341,15 @@ def test_the_plan_asks_for_what_is_known_least(
     assert [one["heliostat"] for one in plan] == ["AB01", "AA39"]
     assert plan[0]["information_bits"] > 2 * plan[1]["information_bits"] > 0
     assert plan[0]["at"] == "2024-06-03T11:35:00Z"
+    assert plan[0]["reason"] == "its mount was never calibrated"
+    assert plan[1]["reason"].startswith("its mount is known by ")
     night = client.get("/v1/calibration-plan", params={"at": "2024-06-03T00:00:00Z"})
     assert night.status_code == 422
     asked = {"at": NOON, "photographs": 3, "minutes": 30}
     page = client.get("/calibration-plan", params=asked, headers={"Accept": "text/html"}).text
     rows = Page(page).one("tbody").all("tr")
     assert [row.all("a")[0]["href"] for row in rows] == ["/heliostats/AB01", "/heliostats/AA39"]
+    assert "its mount was never calibrated" in page
     dark = client.get(
         "/calibration-plan", params={"at": "2024-06-03T00:00"}, headers={"Accept": "text/html"}
     ).text
@@ -358,6 +367,7 @@ def test_the_plans_page_says_what_it_takes(client: TestClient, tower: Any, prope
     assert "kinematics_properties.actuators" in page
 
 
+@pytest.mark.full
 def test_changed_properties_ask_for_another_calibration(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):

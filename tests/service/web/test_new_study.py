@@ -42,6 +42,7 @@ def test_cost_is_known_before_the_study_starts(real_client: TestClient):
     assert real_client.get("/v1/jobs").json()["items"] == jobs
 
 
+@pytest.mark.full
 def test_form_requests_what_it_shows(real_client: TestClient):
     payload = requested(real_client, heliostats="*a*, AC43", candidates="camera_shoulder", since="")
     assert payload["heliostats"] == ["AA39", "AC43"]

@@ -55,11 +55,14 @@ WITHOUT_UNIT = {
     "accuracy_before",
     "accuracy_mean",
     "accuracy_median",
+    "after",
     "attenuation",
+    "before",
     "blocking",
     "cleanliness",
     "cosine",
     "explained_share",
+    "gain_share",
     "gear",
     "intercept",
     "mahalanobis_distance",
@@ -80,6 +83,8 @@ WITHOUT_UNIT = {
     "median",
     # Values of an effect's parameter, whose unit is the field beside it (DESIGN.md, section 7).
     "by_day",
+    "limits",
+    "value",
     # Of cameras: matrices, and coefficients of a lens.
     "distortion",
     "homography",

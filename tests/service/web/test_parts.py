@@ -14,7 +14,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.drawing.templates import figure, percent, power
+from service.drawing.templates import figure, percent, prefixed
 from service.web.responses.csv_tables import PageTable
 from tests.page import Page
 from tests.service.conftest import Post, png
@@ -38,12 +38,21 @@ def table_of(*rows: dict[str, Any], page_only: str = "") -> list[list[str]]:
 
 def test_numbers_have_all_digits_and_units_are_in_headings():
     columns, *rows = table_of(
-        {"Name": "a", "Power": power(1234.5678), "Width [m]": figure(1 / 3), "Stop": ""},
+        {"Name": "a", "Power": prefixed(1234.5678, "W"), "Width [m]": figure(1 / 3), "Stop": ""},
         {"Name": "–", "Power": figure(None, unit="W"), "Width [m]": figure(-2.0), "Stop": ""},
         page_only="Stop",
     )
     assert columns == ["Name", "Power [W]", "Width [m]"]
     assert rows == [["a", "1234.5678", repr(1 / 3)], ["", "", "-2.0"]]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(3.54983e8, "355 MW"), (1_496_490, "1.50 MW"), (999_600, "1.00 MW"), (-4210, "−4.21 kW"),
+     (999.4, "999 W"), (0, "0 W"), (None, "–")],
+)  # fmt: skip
+def test_powers_have_three_figures(value: float | None, shown: str):
+    assert prefixed(value, "W").replace("\N{NO-BREAK SPACE}", " ") == shown
 
 
 def test_rows_of_several_units_have_the_unit_in_the_first_cell():

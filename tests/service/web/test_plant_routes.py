@@ -29,6 +29,7 @@ def test_plant_brings_its_targets(client: TestClient, tower: dict[str, Any]):
         "declared": None,
         "sun_shape": {"shape": "buie", "chi": 0.02, "csr": pytest.approx(0.0058, abs=1e-4)},
         "tower_size": None,
+        "camera_choice": None,
     }
     listed = client.get("/v1/targets").json()
     assert [target["name"] for target in listed["items"]] == ["lower", "upper"]
@@ -365,7 +366,7 @@ def test_declared_optics_make_the_light_of_forecasts(
         "/v1/plant?reason=surveyed", json=tower | {"declared": {"optics": {"reflectivity": 1.5}}}
     )
     assert bad.status_code == 422
-    assert "optics: reflectivity: must be less than or equal to 1" in bad.json()["detail"]
+    assert "optics: reflectivity: must be 1 or less" in bad.json()["detail"]
     declared = {"optics": {"reflectivity": 0.9, "attenuation": [0.01, 0.1]}}
     assert (
         client.put("/v1/plant?reason=surveyed", json=tower | {"declared": declared}).json()[

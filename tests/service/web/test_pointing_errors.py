@@ -36,6 +36,7 @@ def test_without_a_calibration_there_is_none(client: TestClient):
     assert of_field(client) == {"items": [], "next": None, "pending": 0}
 
 
+@pytest.mark.full
 def test_newest_photographs_are_held_against_the_mount(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):
@@ -137,6 +138,7 @@ def test_photographs_without_a_time_say_of_no_move(
     assert client.get("/v1/alarms", params={"reason": "moved"}).json()["items"] == []
 
 
+@pytest.mark.full
 def test_a_growing_error_has_a_trend(client: TestClient, post: Post, tower: Any, properties: Any):
     taken = photographs(tower, properties)
     for number, one in enumerate(taken[:7]):
@@ -149,6 +151,7 @@ def test_a_growing_error_has_a_trend(client: TestClient, post: Post, tower: Any,
     assert client.get(PATH).json()["trend_mrad"] > 1
 
 
+@pytest.mark.full
 def test_a_mount_that_fits_no_more_has_no_pointing_error(
     client: TestClient, post: Post, tower: Any, properties: Any
 ):

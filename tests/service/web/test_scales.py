@@ -93,4 +93,4 @@ def test_difference_is_forecast_minus_photograph(pages: TestClient):
     )
     assert arrays["difference"][:, :30].max() < 0
     page = text_of(pages, "/heliostats/AA39/photographs/101")
-    assert "Colours from -0.3 to 0.3" in page
+    assert "from -0.3 to 0.3 of the measured peak" in page

@@ -92,7 +92,7 @@ class Telling(slots.ComputeSlots):
         super().enter(timeout_s, check)
 
 runtime.ComputeSlots = Telling
-runtime.load_operations = lambda networks: Slow()
+runtime.load_operations = lambda *_: Slow()
 serve(Settings())
 """
 

@@ -21,16 +21,16 @@ from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, 
 from tests.service.web.at_once import at_once
 from tests.service.web.pages import HTML, make_key, press, text_of
 
-ROOT = Path(service.__file__).parent
+ROOT = Path(service.__file__).parents[1]
 PARALLEL = {
-    "cli/demo.py": "a new study",
-    "twin/forecasts/heliostat_forecast.py": "new forecasts",
-    "twin/photographs/deletion.py": "files of deleted photographs",
-    "twin/photographs/ingest.py": "new photographs, which lock their heliostat",
-    "twin/photographs/repeats.py": "the entry of a forced photograph",
-    "twin/surfaces/prediction.py": "new surfaces, which lock their heliostat",
-    "web/root/session.py": "sessions",
-    "cli/folder_store.py": "a temporary store",
+    "heliotwin/cli/demo.py": "a new study",
+    "service/twin/forecasts/heliostat_forecast.py": "new forecasts",
+    "service/twin/photographs/deletion.py": "files of deleted photographs",
+    "service/twin/photographs/ingest.py": "new photographs, which lock their heliostat",
+    "service/twin/photographs/repeats.py": "the entry of a forced photograph",
+    "service/twin/surfaces/prediction.py": "new surfaces, which lock their heliostat",
+    "service/web/root/session.py": "sessions",
+    "heliotwin/folder_store.py": "a temporary store",
 }
 """Modules with transactions beside changes of state, and what they write."""
 
@@ -56,7 +56,8 @@ def services(
 
 
 def test_every_change_of_state_is_a_transaction_of_its_kind():
-    files = [file for part in ("twin", "web", "cli") for file in (ROOT / part).rglob("*.py")]
+    parts = ("service/twin", "service/web", "heliotwin")
+    files = [file for part in parts for file in (ROOT / part).rglob("*.py")]
     found = {str(one.relative_to(ROOT)) for one in files if ".writing()" in one.read_text()}
     assert found == set(PARALLEL)
 

@@ -15,11 +15,11 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
+from heliotwin.cli.main import app as cli
 from model.ephemeris import sun_angles_at
 from model.frames import sun_direction
 from model.times import format_minute
 from service.base.settings import Settings
-from service.cli.main import app as cli
 from service.sources.folder import read_folder
 from service.store.columns import now
 from service.twin.runtime.runtime import Runtime
@@ -84,7 +84,7 @@ def test_a_time_is_null_and_never_1970(imported: TestClient, tmp_path: Path):
     assert imported.get("/v1/heliostats/BG14/measurements?dated=true").json()["items"] == []
     rows = list(csv.DictReader(io.StringIO(imported.get("/heliostats/BG14/photographs.csv").text)))
     assert {row["taken_at"] for row in rows} == {""}
-    page = imported.get("/photographs?time=unknown&heliostat=BG14", headers=HTML).text
+    page = imported.get("/photographs?dated=false&heliostat=BG14", headers=HTML).text
     assert page.count("time unknown") == 24
     assert "1970" not in page
     assert (
@@ -247,3 +247,21 @@ def test_a_sun_that_contradicts_its_time_is_a_warning_everywhere(client: TestCli
     right = {"reason": "typing", "sun": sun_at(azimuth, elevation)}
     assert client.patch(f"{BASE}/2", json=right).json()["measurement"]["warnings"] == []
     assert alarms_of(client, "sun_contradicts_time") == []
+
+
+def test_warnings_are_dated_by_their_change(client: TestClient, post: Post):
+    """One warning is chance; the change is where they become usual."""
+    moment = datetime(2024, 6, 15, 10, 0, tzinfo=UTC)
+    for day in range(12):
+        at = moment + timedelta(days=day)
+        azimuth, elevation = sun_angles_at(at, ORIGIN)
+        is_wrong = day == 2 or day >= 6
+        sun = sun_at((azimuth + 110 * is_wrong) % 360, elevation)
+        sent = post(png(day), id=str(day), taken_at=at.isoformat(), sun=sun)
+        assert bool(sent.json()["warnings"]) == is_wrong
+    (item,) = alarms_of(client, "sun_contradicts_time")
+    assert item["message"] == (
+        "7 measurements with a sun that contradicts the time,"
+        " most since a time after 2024-06-20 10:00 UTC"
+    )
+    assert item["since"] == "2024-06-21T10:00:00Z"

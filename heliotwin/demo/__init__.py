@@ -1,0 +1,1 @@
+"""Plants of the demonstration: mirrors with known surfaces and faults, and their photographs."""

@@ -1,0 +1,642 @@
+"""What has no name: corrections of forecasts by generic terms, located and scaled.
+
+Notes
+-----
+A term is a kind (`model.effects.generic_kinds`), a scaling and an owner. The coefficients of a
+photograph n are linear in a covariate z of zero mean and unit variance::
+
+    c_n = b_0[owner] + b_1[owner] z_n                      b_0 alone for the scaling "constant"
+    b   = argmin sum_n |r_n - D_n c_n|**2 + ridge |b|**2   r, D in shares of photographs' peaks
+
+All terms are compared by cross-validation on the fitted photographs. The best is fitted by
+Gauss-Newton with exact changes of the forecasts, and further terms are added to it. Held-out
+photographs judge the sum. Source of the ridge and its cross-validation: Hastie, Tibshirani and
+Friedman, *The Elements of Statistical Learning* (2009), sections 3.4.1 and 7.10.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.covariates import SCALINGS, Covariate, covariates_of
+from model.effects import Effect
+from model.effects.generic_kinds import GenericKind, Owner, Place
+from model.images import COARSE_SIZE, FLUX_SIZE, binned
+from model.metrics import flux_accuracies
+from model.study.generic_terms import GenericModel
+from model.study.judging import BeforeAfter, Gain, gain_to_json, paired_gain
+from model.study.trials import Trial, TrialFitter
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PLACES = {
+    "mirror": "the mirrors",
+    "angle": "the angles of sun and mount",
+    "camera": "the camera",
+    "target": "the target's surface",
+    "geometry": "the geometry of the image",
+    "added_light": "light that is added",
+}
+"""Where a discrepancy lives, in words."""
+
+RIDGES = (0.01, 0.1, 1.0)
+"""Prior precisions of coefficients, of components that change photographs by one on the average."""
+
+FOLDS = 4
+"""Parts of the fitted photographs for cross-validation."""
+
+ITERATIONS = 3
+"""Steps of Gauss-Newton."""
+
+MAX_TERMS = 3
+"""Largest number of terms of a discrepancy."""
+
+MIN_SHARE = 0.1
+"""Smallest share of the excess error that a further term must gain in cross-validation."""
+
+SCREENED = 5
+"""Number of the best terms that are compared at all ridges."""
+
+MIN_PROGRESS = 1e-4
+"""Smallest gain of accuracy by a step of Gauss-Newton after the first."""
+
+SIMPLER = 0.98
+"""Share of the best term's gain for which a term of fewer coefficients is preferred."""
+
+LOCATED = 0.2
+"""Largest share of the excess error that may stay unexplained where a discrepancy is located."""
+
+
+MIN_RIVALRY = 0.5
+"""Smallest share of the best term's gain with which another term is its rival."""
+
+VARIED: dict[Place, str] = {
+    "mirror": "several heliostats under the same sun",
+    "angle": "heliostats near and far from the target",
+    "camera": "by another camera or setting",
+    "target": "on another target",
+    "geometry": "with spots at other places of the target",
+    "added_light": "of the target without a spot",
+}
+"""Photographs that a correction of a place predicts, and others do not."""
+
+
+@dataclass(frozen=True)
+class GenericTerm:
+    """A kind of generic term with a scaling, None for a constant one, and an owner."""
+
+    kind: GenericKind
+    scaling: Covariate | None
+    owner: Owner
+
+    @property
+    def described(self) -> str:
+        """The term in words."""
+        scaling = f" that scales with {self.scaling.name}" if self.scaling else ""
+        owner = "" if self.owner in ("all", "camera") else f", separate for each {self.owner}"
+        return f"a correction of {PLACES[self.kind.lives_in]}{scaling}{owner}"
+
+    def competes_with(self, other: "GenericTerm") -> bool:
+        """Whether the other acts elsewhere, or scales with something else."""
+        return self.kind.lives_in != other.kind.lives_in or self.scaling != other.scaling
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Changes (N, K, P) by a kind's components, of unit mean square, in shares of peaks.
+
+    ``sizes`` (K,) are the root mean squares before.
+    """
+
+    values: NDArray[np.float32]
+    sizes: Array
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products (N, K, K) of the components."""
+        return np.asarray(self.values @ self.values.transpose(0, 2, 1), dtype=np.float64)
+
+    def total(self, amounts: Array) -> Array:
+        """Changes (N, P) by amounts (N, K) of components of unit size."""
+        total = amounts.astype(np.float32)[:, None] @ self.values
+        return np.asarray(total[:, 0], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Ridge regression of residuals on a term.
+
+    Attributes
+    ----------
+    fields : Fields
+    residual : (N, P)
+        Without any of the term's changes.
+    factors : (N, J)
+        One, and the covariate.
+    owners : (N,)
+        Index of each photograph's owner.
+    """
+
+    fields: Fields
+    residual: Array
+    factors: Array
+    owners: NDArray[np.int64]
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products (N, M, M) of the M coefficients' changes."""
+        pairs = np.einsum("ni,nj,nkl->nikjl", self.factors, self.factors, self.fields.gram)
+        size = pairs.shape[1] * pairs.shape[2]
+        return np.asarray(pairs.reshape(-1, size, size))
+
+    def _products(self, images: Array) -> Array:
+        """Products (N, M) of the coefficients' changes with images (N, P)."""
+        each = (self.fields.values @ images.astype(np.float32)[:, :, None])[:, :, 0]
+        return np.asarray(np.einsum("ni,nk->nik", self.factors, each).reshape(len(images), -1))
+
+    @cached_property
+    def right(self) -> Array:
+        """Products (N, M) with the residual."""
+        return self._products(self.residual)
+
+    def solve(self, training: Mask, ridge: float) -> Array:
+        """Coefficients (owners, M) by the photographs of ``training`` (N,)."""
+        found = np.zeros((self.owners.max() + 1, self.gram.shape[-1]))
+        for owner in range(len(found)):
+            own = training & (self.owners == owner)
+            gram = self.gram[own].sum(axis=0) + ridge * np.eye(found.shape[1])
+            found[owner] = np.linalg.solve(gram, self.right[own].sum(axis=0))
+        return found
+
+    def amounts(self, coefficients: Array) -> Array:
+        """Amounts (N, K) of the components in each photograph."""
+        own = coefficients[self.owners].reshape(len(self.owners), self.factors.shape[1], -1)
+        return np.asarray(np.einsum("ni,nik->nk", self.factors, own))
+
+    def left(self, coefficients: Array) -> Array:
+        """What of the residual (N, P) is left."""
+        return self.residual - self.fields.total(self.amounts(coefficients))
+
+    def left_without(self, groups: NDArray[np.int64], ridge: float) -> Array:
+        """What of the residual (N, P) is left by fits to the photographs of other ``groups``."""
+        amounts = np.empty(self.fields.values.shape[:2])
+        for group in np.unique(groups):
+            out = groups == group
+            amounts[out] = self.amounts(self.solve(~out, ridge))[out]
+        return self.residual - self.fields.total(amounts)
+
+    def deviations(self, coefficients: Array, training: Mask, ridge: float) -> Array:
+        """Standard deviations (owners, M) by the sandwich estimator over photographs."""
+        scores, found = self._products(self.left(coefficients)), np.zeros_like(coefficients)
+        for owner in range(len(found)):
+            own = training & (self.owners == owner)
+            bread = np.linalg.inv(self.gram[own].sum(axis=0) + ridge * np.eye(found.shape[1]))
+            filling = scores[own].T @ scores[own] * own.sum() / max(1, own.sum() - 1)
+            found[owner] = np.sqrt(np.diag(bread @ filling @ bread))
+        return found
+
+
+class Linearised(NamedTuple):
+    """Changes by a kind's components about some amounts, and the residual (N, P) without those."""
+
+    fields: Fields
+    residual: Array
+
+    def subset(self, rows: Mask) -> "Linearised":
+        """The same of some photographs."""
+        return Linearised(Fields(self.fields.values[rows], self.fields.sizes), self.residual[rows])
+
+
+class Iterated(NamedTuple):
+    """Cuts (N, 64, 64) with a fitted term, and the linear model there."""
+
+    cuts: Array
+    point: Linearised
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A term that gains nearly as much as the best one, and what would distinguish them.
+
+    Attributes
+    ----------
+    term : GenericTerm
+    gain_share : float [1]
+        Its gain in cross-validation, of that of the best one.
+    photographs : str
+        Those in which the two differ.
+    """
+
+    term: GenericTerm
+    gain_share: float
+    photographs: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As in a study's report."""
+        return {
+            "in_words": self.term.described,
+            "gain_share": round(self.gain_share, 3),
+            "distinguished_by": self.photographs,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class TermChoice:
+    """A term to add, its ridge, its gain in cross-validation, and its linear model."""
+
+    term: GenericTerm
+    ridge: float
+    gain: float
+    point: Linearised
+    rival: "Rival | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTerm:
+    """A fitted generic term.
+
+    Attributes
+    ----------
+    choice : TermChoice
+    regression : Regression
+        Of all photographs, linear about the fit.
+    cuts : (N, 64, 64)
+        Forecasts with this term and those before it.
+    training : (N,)
+        Which photographs were fitted.
+    """
+
+    choice: TermChoice
+    regression: Regression
+    cuts: Array
+    training: Mask
+
+    @cached_property
+    def coefficients(self) -> Array:
+        """Coefficients (owners, M) of components of unit size."""
+        return self.regression.solve(self.training, self.choice.ridge)
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations (owners, M) of the coefficients."""
+        return self.regression.deviations(self.coefficients, self.training, self.choice.ridge)
+
+
+class Scale(NamedTuple):
+    """Mean, standard deviation and limits of a covariate, in its unit."""
+
+    mean: float
+    std: float
+    limits: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Discrepancy:
+    """A correction of forecasts that no effect of the catalogue describes.
+
+    Attributes
+    ----------
+    terms : list of FittedTerm
+        In the order in which they change forecasts.
+    owners : dict of list of str
+        Names of the heliostats or targets that have coefficients.
+    scales : dict of Scale
+        Of the covariates.
+    accuracy : (H,)
+        Of the held-out photographs.
+    change : (64, 64)
+        Mean change of their forecasts, in shares of the photographs' peaks.
+    gain : Gain
+        Of accuracy, by held-out photographs.
+    explained_share : float [1]
+        Share of the excess error that the correction removes.
+    place_share : float [1]
+        The same of all terms in the first one's place.
+    transfer : dict of BeforeAfter or None
+        By heliostats, days and targets that were left out in turn; None where it cannot be tested.
+    """
+
+    terms: list[FittedTerm]
+    owners: dict[Owner, list[str]]
+    scales: dict[Covariate, Scale]
+    accuracy: Array
+    change: Array
+    gain: Gain
+    explained_share: float
+    place_share: float
+    transfer: dict[str, BeforeAfter | None]
+
+    @property
+    def lives_in(self) -> Place | None:
+        """Where it acts, if terms of one place leave little."""
+        is_located = 1 - self.place_share <= LOCATED
+        return self.terms[0].choice.term.kind.lives_in if is_located else None
+
+    @property
+    def described(self) -> str:
+        """The first term in words."""
+        return self.terms[0].choice.term.described
+
+    def in_words(self) -> str:
+        """What the report says."""
+        located = (
+            f"What has no name lives in {PLACES[self.lives_in]}."
+            if self.lives_in is not None
+            else "Where it acts cannot be said."
+        )
+        unseen = [
+            f"{name} that no fit saw ({one.before:.1%} before) to {one.after:.1%}"
+            for name, one in self.transfer.items()
+            if one is not None
+        ]
+        transfer = f" The forecasts of {', of '.join(unseen)}." if unseen else ""
+        correction = self.described[0].upper() + self.described[1:]
+        return (
+            f"{located} {correction} explains {self.explained_share:.0%} of the error beyond noise:"
+            f" accuracy on held-out images {self.accuracy.mean():.1%}.{transfer} It is a correction"
+            " and no cause."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The discrepancy of a report (DESIGN.md, section 7)."""
+        term, rival = self.terms[0].choice.term, self.terms[0].choice.rival
+        return {
+            "lives_in": self.lives_in,
+            "scaling": term.scaling.key if term.scaling else "constant",
+            "owner": term.owner,
+            "explained_share": round(self.explained_share, 4),
+            "accuracy_after": round(float(self.accuracy.mean()), 5),
+            "accuracy_gain": gain_to_json(self.gain),
+            "transfer": {
+                name: None if one is None else {k: round(v, 5) for k, v in one._asdict().items()}
+                for name, one in self.transfer.items()
+            },
+            "rival": None if rival is None else rival.to_json(),
+            "coefficients": [entry for one in self.terms for entry in self._coefficients(one)],
+            "in_words": self.in_words(),
+        }
+
+    def _coefficients(self, fitted: FittedTerm) -> Iterator[dict[str, Any]]:
+        """Coefficients of a term with their 95 % intervals, in the components' units."""
+        term = fitted.choice.term
+        shape = len(self.owners[term.owner]), -1, len(term.kind.components)
+        values, deviations = (
+            part.reshape(shape) / fitted.regression.fields.sizes
+            for part in (fitted.coefficients, fitted.deviations)
+        )
+        for index, owner in enumerate(self.owners[term.owner]):
+            for factor in range(values.shape[1]):
+                scaling = term.scaling if factor else None
+                scale = self.scales[scaling] if scaling else Scale(0.0, 1.0)
+                for number, component in enumerate(term.kind.components):
+                    value = values[index, factor, number] / scale.std
+                    reach = 1.96 * deviations[index, factor, number] / scale.std
+                    yield {
+                        "kind": term.kind.name,
+                        "name": component.name,
+                        "of": owner if term.owner in ("heliostat", "target") else None,
+                        "unit": component.unit,
+                        "value": float(f"{value:.5g}"),
+                        "ci95": [float(f"{value - reach:.5g}"), float(f"{value + reach:.5g}")],
+                        "per": scaling.per(scale.mean, scale.limits) if scaling else None,
+                    }
+
+
+class _Search:
+    """Forward selection of generic terms on top of a trial's effects."""
+
+    def __init__(self, fitter: TrialFitter, effects: Sequence[Effect]) -> None:
+        self.fitter, options = fitter, fitter.options
+        rows = np.arange(len(fitter.flux_images))
+        self.model = GenericModel(fitter.forecaster(rows, options.view), effects, options.fit_view)
+        self.measured = self.model.forecaster.measured(FLUX_SIZE)
+        self.peaks = binned(self.measured, COARSE_SIZE).max(axis=(1, 2))[:, None]
+        self.is_fitted = np.isin(rows, fitter.split.fitted)
+        names = {
+            "all": ["all"] * len(rows),
+            "camera": ["camera"] * len(rows),
+            "heliostat": fitter.heliostats.tolist(),
+            "target": [p.setup.plane.name for p in fitter.flux_images],
+        }
+        self.owners = {owner: np.unique(of, return_inverse=True) for owner, of in names.items()}
+        self.covariates = {
+            covariate: values
+            for covariate, values in covariates_of(
+                [p.setup for p in fitter.flux_images], fitter.model.site, SCALINGS
+            ).items()
+            if np.ptp(values[self.is_fitted]) > 0
+        }
+        self.folds = np.zeros(len(rows), dtype=np.int64)
+        for own in range(len(self.owners["heliostat"][0])):
+            (some,) = np.nonzero(self.is_fitted & (self.owners["heliostat"][1] == own))
+            self.folds[some] = np.arange(len(some)) % FOLDS
+
+    def residual(self, cuts: Array) -> Array:
+        """Measured minus forecast (N, P), in shares of peaks."""
+        difference = binned(self.measured - cuts, COARSE_SIZE)
+        return np.asarray(difference.reshape(len(cuts), -1) / self.peaks)
+
+    def accuracy(self, left: Array, rows: Mask | slice = slice(None)) -> float:
+        """Mean accuracy of photographs with an error (n, P) in shares of peaks."""
+        return 1 - float((np.abs(left) * self.peaks[rows]).sum(axis=1).mean())
+
+    def fields(self, kind: GenericKind, cuts: Array, amounts: Array | None = None) -> Fields:
+        """Changes by a kind's components at cuts that have amounts (N, K) of it."""
+        if amounts is None:
+            amounts = np.zeros((len(cuts), len(kind.components)))
+        values = self.model.derivatives(kind, cuts, amounts, COARSE_SIZE)
+        values = values.reshape(*amounts.shape, -1) / self.peaks[:, None].astype(np.float32)
+        sizes = np.sqrt((values[self.is_fitted] ** 2).sum(axis=2).mean(axis=0)) + 1e-12
+        return Fields(values / sizes[:, None], sizes.astype(np.float64))
+
+    def regression(
+        self, term: GenericTerm, point: Linearised, rows: Mask | slice = slice(None)
+    ) -> Regression:
+        """The regression of all photographs, or of those of a point at some ``rows``."""
+        factors = [np.ones(len(self.is_fitted))]
+        if term.scaling is not None:
+            mean, std, _ = self.scale(term.scaling)
+            factors.append((self.covariates[term.scaling] - mean) / std)
+        owners = self.owners[term.owner][1][rows]
+        return Regression(*point, np.stack(factors, axis=1)[rows], owners)
+
+    def scale(self, covariate: Covariate) -> Scale:
+        """Mean and deviation of a covariate of the fitted photographs."""
+        values = self.covariates[covariate][self.is_fitted]
+        limits = float(values.min()), float(values.max())
+        return Scale(float(values.mean()), float(values.std()), limits)
+
+    def cross_validated(self, term: GenericTerm, point: Linearised, ridge: float) -> float:
+        """Accuracy of the fitted photographs, those of ``point``, each by a fit without it."""
+        regression = self.regression(term, point, self.is_fitted)
+        left = regression.left_without(self.folds[self.is_fitted], ridge)
+        return self.accuracy(left, self.is_fitted)
+
+    def terms(self) -> list[GenericTerm]:
+        """All terms that the photographs may show."""
+        return [
+            GenericTerm(kind, scaling, owner)
+            for kind in self.model.kinds
+            for owner in kind.owners
+            if owner in ("all", "camera") or len(self.owners[owner][0]) > 1
+            for scaling in (None, *(self.covariates if kind.is_smooth else []))
+        ]
+
+    def best(self, cuts: Array) -> TermChoice:
+        """The simplest of the best terms."""
+        before = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
+        points = {kind.name: self.linearise(kind, cuts) for kind in self.model.kinds}
+        fitted = {name: point.subset(self.is_fitted) for name, point in points.items()}
+
+        def choose(term: GenericTerm, ridge: float) -> TermChoice:
+            gain = self.cross_validated(term, fitted[term.kind.name], ridge) - before
+            return TermChoice(term, ridge, gain, points[term.kind.name])
+
+        screened = sorted(
+            (choose(term, RIDGES[1]) for term in self.terms()), key=lambda choice: -choice.gain
+        )
+        few = [choose(one.term, ridge) for one in screened[:SCREENED] for ridge in RIDGES]
+        best = max(few, key=lambda choice: choice.gain)
+        chosen = min(
+            (choice for choice in few if choice.gain >= SIMPLER * best.gain),
+            key=lambda choice: (self._complexity(choice.term), -choice.gain),
+            default=best,
+        )
+        return replace(chosen, rival=find_rival(self, chosen, screened))
+
+    def _complexity(self, term: GenericTerm) -> int:
+        """Number of a term's coefficients."""
+        of_owner = len(term.kind.components) * (1 + (term.scaling is not None))
+        return of_owner * len(self.owners[term.owner][0])
+
+    def linearise(self, kind: GenericKind, cuts: Array) -> Linearised:
+        """The linear model of a kind, about its best constant amounts if those are fast to find."""
+        point = Linearised(self.fields(kind, cuts), self.residual(cuts))
+        if kind.basis is None:
+            return point
+        term = GenericTerm(kind, None, kind.owners[0])
+        return self.iterate(term, RIDGES[1], cuts, point).point
+
+    def iterate(self, term: GenericTerm, ridge: float, cuts: Array, point: Linearised) -> Iterated:
+        """Fit a term by Gauss-Newton, with exact changes of the cuts."""
+        best = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
+        found = Iterated(cuts, point)
+        for _ in range(ITERATIONS):
+            regression = self.regression(term, found.point)
+            amounts = regression.amounts(regression.solve(self.is_fitted, ridge))
+            amounts = amounts / found.point.fields.sizes
+            changed = self.model.apply(term.kind, cuts, amounts)
+            left = self.residual(changed)
+            accuracy = self.accuracy(left[self.is_fitted], self.is_fitted)
+            if accuracy <= best + MIN_PROGRESS:
+                break
+            fields, best = self.fields(term.kind, changed, amounts), accuracy
+            residual = left + fields.total(amounts * fields.sizes)
+            found = Iterated(changed, Linearised(fields, residual))
+        return found
+
+    def fit(self, choice: TermChoice, cuts: Array) -> FittedTerm:
+        """Fit a chosen term."""
+        found = self.iterate(choice.term, choice.ridge, cuts, choice.point)
+        regression = self.regression(choice.term, found.point)
+        return FittedTerm(choice, regression, found.cuts, self.is_fitted)
+
+    def transfer(self, found: Sequence[FittedTerm], groups: Sequence[object]) -> BeforeAfter | None:
+        """Accuracy of photographs of each group by fits to the other groups; None for one group."""
+        names, index = np.unique([str(group) for group in groups], return_inverse=True)
+        if len(names) < 2:
+            return None
+        left = self.residual(found[-1].cuts)
+        for fitted in found:
+            whole = fitted.regression.left(fitted.coefficients)
+            left = left + fitted.regression.left_without(index, fitted.choice.ridge) - whole
+        before = self.residual(self.model.cuts)
+        return BeforeAfter(self.accuracy(before), self.accuracy(left))
+
+
+def find_rival(search: _Search, best: TermChoice, others: Sequence[TermChoice]) -> Rival | None:
+    """The best of ``others``, the best first, that competes; None if it gains little."""
+    other = next(one for one in others if one.term.competes_with(best.term))
+    if other.gain < MIN_RIVALRY * best.gain:
+        return None
+    pair = best.term.scaling, other.term.scaling
+    both = [search.covariates[s][search.is_fitted] for s in pair if s is not None]
+    related = float(np.asarray(np.corrcoef(both))[0, 1]) if len(both) == 2 else 0.0
+    photographs = photographs_to_compare(best.term, other.term, related)
+    return Rival(other.term, other.gain / best.gain, photographs)
+
+
+def photographs_to_compare(first: GenericTerm, second: GenericTerm, related: float) -> str:
+    """Photographs in which two terms differ.
+
+    ``related`` is the correlation of their covariates in the photographs that were compared.
+    """
+    names = [term.scaling.name for term in (first, second) if term.scaling is not None]
+    if first.scaling == second.scaling:
+        places = {VARIED[term.kind.lives_in]: None for term in (first, second)}
+        return f"photographs {', and '.join(places)}"
+    if len(names) == 1:
+        return f"photographs beyond the range of {names[0]} that is covered"
+    ends = ("high", "low") if related > 0 else ("high", "high")
+    return (
+        f"photographs of a {ends[0]} {names[0]} with a {ends[1]} {names[1]}, and the reverse: so"
+        f" far the two vary together (correlation {related:+.2f})"
+    )
+
+
+def find_discrepancy(
+    fitter: TrialFitter, base: Trial, noise: float, max_terms: int = MAX_TERMS
+) -> Discrepancy | None:
+    """Find the generic terms that correct the forecasts of a trial; None if none is worthwhile.
+
+    ``noise`` is the error that even the truth leaves.
+    """
+    search = _Search(fitter, base.effects)
+    cuts, held_out = search.model.cuts, fitter.split.held_out
+    excess = 1 - noise - float(base.accuracy.mean())
+    found: list[FittedTerm] = []
+    for _ in range(max_terms):
+        choice = search.best(cuts)
+        if choice.gain < max(MIN_SHARE * excess, fitter.options.min_gain):
+            break
+        found.append(search.fit(choice, cuts))
+        cuts = found[-1].cuts
+    if not found:
+        return None
+    accuracies = [flux_accuracies(fitter.measured, one.cuts[held_out]) for one in found]
+    gain = paired_gain(accuracies[-1] - base.accuracy, fitter.heliostats[held_out])
+    if gain.low <= 0:
+        return None
+    change = found[-1].cuts[held_out] - search.model.cuts[held_out]
+    steps = np.diff([base.accuracy.mean(), *(accuracy.mean() for accuracy in accuracies)])
+    place = found[0].choice.term.kind.lives_in
+    in_place = sum(
+        step
+        for step, one in zip(steps, found, strict=True)
+        if one.choice.term.kind.lives_in == place
+    )
+    owned = {one.choice.term.owner for one in found}
+    days: Sequence[object] = fitter.days or [None]
+    transfer = {
+        "heliostats": fitter.heliostats.tolist() if "heliostat" not in owned else [None],
+        "days": days if None not in days else [None],
+        "targets": [p.setup.plane.name for p in fitter.flux_images]
+        if "target" not in owned
+        else [None],
+    }
+    return Discrepancy(
+        terms=found,
+        owners={owner: search.owners[owner][0].tolist() for owner in owned},
+        scales={c: search.scale(c) for one in found if (c := one.choice.term.scaling) is not None},
+        accuracy=accuracies[-1],
+        change=(change / fitter.measured.max(axis=(1, 2), keepdims=True)).mean(axis=0),
+        gain=gain,
+        explained_share=float(np.clip(steps.sum() / excess, 0, 1)),
+        place_share=float(np.clip(in_place / excess, 0, 1)),
+        transfer={name: search.transfer(found, groups) for name, groups in transfer.items()},
+    )

@@ -1,0 +1,253 @@
+"""Generic terms on the forecasts of photographs: their derivatives, and exact changes.
+
+Forecasts are cuts about the spots' centres of mass. After each change
+(`model.effects.generic_kinds`) they are centred again and scaled to sum one (`SpotImages.settle`),
+as photographs are.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.effects import Effect, apply_optics_effects, effects_of_stage
+from model.effects.generic_kinds import (
+    IMAGE_KINDS,
+    GenericKind,
+    SpotImages,
+    beam_turns,
+    changed_images,
+    deformed,
+    height_shapes,
+    mirror_kinds,
+)
+from model.forecast import Aligned, View
+from model.images import FLUX_SIZE
+from model.study.flux_images import FluxImage, Forecaster, centers
+from model.tracing import Optics, Scene, Window
+from model.tracing.beam import N_TURNS
+from model.tracing.convolution import beam_moves, central_rays, raster, splat
+from model.tracing.scene import irradiance_of, optics_of
+from model.tracing.sensitivity import sensitivity
+
+Array = NDArray[np.float64]
+
+AT_ONCE = 8
+"""Photographs whose derivatives are in memory at once."""
+
+
+class GenericModel:
+    """Applies generic terms to the forecasts of photographs under some effects."""
+
+    def __init__(self, forecaster: Forecaster, effects: Sequence[Effect], view: View) -> None:
+        self.forecaster = forecaster
+        self.view = replace(view, rows=FLUX_SIZE, columns=FLUX_SIZE, window=forecaster.window)
+        self.cuts = forecaster.cuts(effects)
+        self.aligned: Aligned = forecaster.aligned(effects)
+        self.flux_images: Sequence[FluxImage] = forecaster.flux_images
+        self.planes = forecaster.planes
+        self.places = np.concatenate(
+            [centers(p.image[None], [p.setup.plane]) for p in self.flux_images]
+        )
+        self.moves, self.slant_range = _light_moves(self.aligned)
+        first = self.aligned.groups[0].scene.control_points[0]
+        facets = first.mean(dim=(-2, -1))[:, :2].double().numpy()
+        is_alike = len({len(p.setup.control_points) for p in self.flux_images}) == 1
+        self.mirrors = MirrorModel(
+            forecaster, self.aligned, self.view, mirror_kinds(facets) if is_alike else []
+        )
+        self.kinds = [*IMAGE_KINDS, *self.mirrors.kinds]
+
+    def spots(self, rows: NDArray[np.intp], cuts: Array) -> SpotImages:
+        """The geometry of some photographs with cuts (n, 64, 64)."""
+        window = self.forecaster.window
+        return SpotImages(
+            images=cuts,
+            size=(window, window),
+            places=self.places[rows] * [1, -1],
+            half=np.array([self.planes[row].width / 2 for row in rows.tolist()])[:, None, None],
+            slant_range=self.slant_range[rows],
+            window=window,
+            moves=self.moves[rows],
+        )
+
+    def _parts(self) -> Iterator[NDArray[np.intp]]:
+        count = len(self.cuts)
+        yield from np.array_split(np.arange(count), -(-count // AT_ONCE))
+
+    def derivatives(
+        self, kind: GenericKind, cuts: Array, coefficients: Array, size: int
+    ) -> NDArray[np.float32]:
+        """Derivatives (N, K, size, size) of cuts (N, 64, 64) with a kind's coefficients (N, K)."""
+        found = np.empty((len(cuts), len(kind.components), size, size), dtype=np.float32)
+        for rows in self._parts():
+            spots = self.spots(rows, cuts[rows])
+            for number, change in enumerate(self._changes(kind, spots, rows, coefficients[rows])):
+                settled = spots.settled_change(change)
+                step = FLUX_SIZE // size
+                found[rows, number] = settled.reshape(-1, size, step, size, step).sum(axis=(2, 4))
+        return found
+
+    def _changes(
+        self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
+    ) -> Iterator[Array]:
+        """Changes (n, 64, 64) of cuts by each component."""
+        if kind.basis is None:
+            yield from self.mirrors.changes(kind, rows, coefficients)
+            return
+        for part in kind.basis(spots):
+            if kind.operator == "transfer":
+                yield spots.filtered(part)
+            elif kind.operator == "warp":
+                yield -(part.swapaxes(0, 1) * spots.slopes).sum(axis=0)
+            else:
+                yield part * (spots.images if kind.operator == "scale" else spots.peaks)
+
+    def apply(self, kind: GenericKind, cuts: Array, coefficients: Array) -> Array:
+        """Cuts (N, 64, 64) with a kind's coefficients (N, K)."""
+        found = np.empty_like(cuts)
+        for rows in self._parts():
+            spots = self.spots(rows, cuts[rows])
+            found[rows] = spots.settle(self._applied(kind, spots, rows, coefficients[rows]))
+        return found
+
+    def _applied(
+        self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
+    ) -> Array:
+        if kind.operator == "heights":
+            return np.asarray(spots.images + self.mirrors.deformation(kind, rows, coefficients))
+        if kind.basis is None:
+            changes = self.mirrors.changes(kind, rows, coefficients)
+            return np.asarray(spots.images + np.einsum("nk,knij->nij", coefficients, changes))
+        return changed_images(kind, spots, coefficients)
+
+
+class MirrorModel:
+    """Traces changes of mirrors, whose ``kinds`` are those of generic terms, in some forecasts."""
+
+    def __init__(
+        self, forecaster: Forecaster, aligned: Aligned, view: View, kinds: Sequence[GenericKind]
+    ) -> None:
+        self.forecaster, self.aligned, self.view, self.kinds = forecaster, aligned, view, kinds
+        self._cached: dict[bytes, dict[str, NDArray[np.float32]]] = {}
+
+    def changes(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
+        """Changes (K, n, 64, 64) of the cuts of mirrors that have coefficients (n, K)."""
+        if kind.operator == "heights" and coefficients.any():
+            return self._traced([kind], rows, coefficients)
+        return np.asarray(self._unchanged(rows)[kind.name], dtype=np.float64)
+
+    def _unchanged(self, rows: NDArray[np.intp]) -> dict[str, NDArray[np.float32]]:
+        """Changes of mirrors without coefficients, by kind; they are traced once for all cuts."""
+        key = rows.tobytes()
+        if key not in self._cached:
+            ends = np.cumsum([len(kind.components) for kind in self.kinds])
+            changes = self._traced(self.kinds, rows, np.zeros((len(rows), 0)))
+            parts = np.split(changes.astype(np.float32), ends[:-1])
+            names = [kind.name for kind in self.kinds]
+            self._cached[key] = dict(zip(names, parts, strict=True))
+        return self._cached[key]
+
+    def _traced(
+        self, kinds: Sequence[GenericKind], rows: NDArray[np.intp], coefficients: Array
+    ) -> Array:
+        """Changes (K, n, 64, 64) by all kinds of mirrors that have coefficients of the first."""
+        view, (first, *_) = self.view, kinds
+        heights = [np.asarray(k.weights) for k in kinds if k.operator == "heights"]
+
+        def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
+            shapes = height_shapes(scene)
+            if first.operator == "heights" and amounts.any():
+                scene = deformed(scene, [first], amounts)
+            found = [view.trace(scene, window, optics)[None]]
+            if heights:
+                weights = torch.as_tensor(np.concatenate(heights))
+                by_heights = partial(sensitivity, shapes=shapes, weights=weights)
+                found.append(
+                    by_heights(scene, window, optics, samples=view.samples, padding=view.padding)
+                )
+            if any(kind.operator == "light" for kind in kinds):
+                found.append(_light_changes(scene, window, optics, view))
+            return torch.cat(found)
+
+        return self._each_part(rows, coefficients, trace)[1:]
+
+    def deformation(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
+        """Change (n, 64, 64) of the cuts by mirrors that get coefficients (n, K)."""
+
+        def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
+            scenes = scene, deformed(scene, [kind], amounts)
+            return torch.stack([self.view.trace(one, window, optics) for one in scenes])
+
+        unchanged, changed = self._each_part(rows, coefficients, trace)
+        return np.asarray(changed - unchanged)
+
+    def _each_part(
+        self,
+        rows: NDArray[np.intp],
+        coefficients: Array,
+        trace: Callable[[Scene, Window, Optics, Tensor], Tensor],
+    ) -> Array:
+        """Cuts (M, n, 64, 64) of some photographs, traced with their coefficients."""
+        places = {row: place for place, row in enumerate(rows.tolist())}
+        found, order = [], []
+        optics_effects = effects_of_stage(self.aligned.model.effects, "optics")
+        for group in self.aligned.groups:
+            for window, there, alike in group.parts(self.view.windows_on(group), optics_effects):
+                some = [place for place in alike if group.rows[place] in places]
+                if not some:
+                    continue
+                self.forecaster.between()
+                own = [places[group.rows[place]] for place in some]
+                optics = apply_optics_effects(there, self.aligned.model.optics)
+                amounts = torch.as_tensor(coefficients[own])
+                with torch.no_grad():
+                    found.append(trace(group.scene.subset(some), window, optics, amounts).numpy())
+                order += own
+        images = np.concatenate(found, axis=1)[:, np.argsort(order)]
+        return np.asarray(images / images[0].sum(axis=(1, 2), keepdims=True))
+
+
+def _light_changes(scene: Scene, window: Window, optics: Optics, view: View) -> Tensor:
+    """Changes (F * 3, n, R, C) of irradiance by each facet's light and its slopes along x and y."""
+    rays = central_rays(scene, view.samples)
+    optics = optics_of(scene, optics)
+    irradiance = irradiance_of(scene, optics, rays.slant_range)
+    on_grid = raster(rays, rays.spot, window, optics, irradiance, (view.padding, view.padding))
+    line = (torch.arange(view.samples).to(rays.power) + 0.5) / view.samples * 2 - 1
+    along = [torch.ones(view.samples, view.samples), *torch.meshgrid(line, line, indexing="ij")]
+    facets = scene.control_points.shape[1]
+    images = []
+    for facet in range(facets):
+        for shares in along:
+            x, y, weight = (
+                rays.view(scene.batch, facets, -1)[:, facet]
+                for rays in (on_grid.x, on_grid.y, on_grid.weight)
+            )
+            images.append(splat(x, y, weight * shares.flatten().to(weight), *on_grid.shape))
+    return on_grid.blurred(torch.stack(images))
+
+
+class _LightMoves(NamedTuple):
+    """How far light moves (N, 4, 2) [m/mrad] with the turns of `model.tracing.beam`; slant ranges
+    (N,) [m].
+    """
+
+    moves: Array
+    slant_range: Array
+
+
+def _light_moves(aligned: Aligned) -> _LightMoves:
+    count = sum(len(group.rows) for group in aligned.groups)
+    found = _LightMoves(np.zeros((count, N_TURNS, 2)), np.zeros(count))
+    for group in aligned.groups:
+        scene, rays = group.scene, central_rays(group.scene, 2)
+        moves = beam_moves(scene, beam_turns(group.setups, scene), rays.direction, rays.slant_range)
+        found.moves[group.rows] = moves.double().numpy()
+        found.slant_range[group.rows] = rays.slant_range.double().numpy()
+    return found

@@ -1,0 +1,67 @@
+"""Changes of beams by angles: moments of the light's directions about sun and mount.
+
+Notes
+-----
+Light that turns by small angles with the moments c_k multiplies the spectrum of an image on a plane
+by ``exp(sum c_k h_k(a, b))``. The phases a, b are the frequency times the movement of light with
+the angle. Second moments may be negative: the light is then sharper than it was traced.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+TAILS_MRAD = (6.0, 15.0)
+"""Widths of scattered light about the sun."""
+
+MAX_SHARPENING = 1.0
+"""Largest exponent of a transfer: detail that a forecast lacks is raised by e at most."""
+
+N_TURNS = 4
+"""Number of turns of a beam: by the sun, sidewards and upwards, and by the mount's axes."""
+
+
+def sun_moments(a: Any, b: Any) -> list[Any]:
+    """Exponents by second and third moments and scattered light, at phases [1/mrad] of the sun."""
+    second = [-a * a / 2, -a * b, -b * b / 2]
+    third = [1j * part for part in (a**3 / 6, a * a * b / 2, a * b * b / 2, b**3 / 6)]
+    # Light that is scattered once and several times, as a share of all.
+    tails = [math.e ** (-(width**2) * (a * a + b * b) / 2) - 1 for width in TAILS_MRAD]
+    return [*second, *third, *tails]
+
+
+def axis_moments(first: Any, second: Any) -> list[Any]:
+    """Exponents by the variances of the angles about both axes, at their phases [1/mrad]."""
+    return [-first * first / 2, -second * second / 2]
+
+
+@dataclass(frozen=True, eq=False)
+class BeamChange:
+    """Changed beams on a plane.
+
+    Attributes
+    ----------
+    moves : Tensor (B, N_TURNS, 2) [m/mrad]
+        Movement of light on the plane, right and up, with each turn.
+    moments : Tensor (B, 11)
+        Factors of `sun_moments` and `axis_moments`.
+    """
+
+    moves: Tensor
+    moments: Tensor
+
+    def transfer(self, right: Tensor, up: Tensor) -> Tensor:
+        """Transfer function (B, R, C) at frequencies right (1, C) and up (R, 1) [cycles/m]."""
+        phases = [
+            2 * math.pi * (move[:, 0, None, None] * right + move[:, 1, None, None] * up)
+            for move in self.moves.unbind(1)
+        ]
+        terms = [*sun_moments(*phases[:2]), *axis_moments(*phases[2:])]
+        total = sum(
+            c[:, None, None] * term for c, term in zip(self.moments.unbind(1), terms, strict=True)
+        )
+        exponent = torch.as_tensor(total)
+        return torch.exp(torch.complex(exponent.real.clamp(max=MAX_SHARPENING), exponent.imag))

@@ -1,0 +1,40 @@
+"""Which results of studies can be adopted."""
+
+import pytest
+
+from service.store.results import StudyFindings
+from service.twin.plant.adoption_rules import names_of, why_refused
+from service.twin.plant.open_questions import open_questions
+
+BETTER, WORSE = {"before": 0.90, "after": 0.95}, {"before": 0.931, "after": 0.92}
+
+
+def correction(**transfer: object) -> StudyFindings:
+    return StudyFindings("unexplained", [{"name": "soiling"}], 1.0, transfer, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("findings", "said"),
+    [
+        (StudyFindings("effect", [{"name": "soiling"}], 0.1), None),
+        (StudyFindings("none", [], 0.0), "found no effect"),
+        (
+            StudyFindings("unexplained", [{"name": "sun_shape"}], 0.4),
+            "sun_shape explains only part",
+        ),
+        (correction(heliostats=BETTER, days=None, targets=WORSE), None),
+        (correction(heliostats=None, days=BETTER), None),
+        (correction(heliostats=None, days=None, targets=BETTER), "tested neither"),
+        (correction(heliostats=BETTER, days=WORSE), "days that no fit saw worse (93.1% before"),
+    ],
+)
+def test_a_correction_is_adopted_if_what_no_fit_saw_does_not_lose(findings, said):
+    refusal = why_refused(findings)
+    assert (refusal is None) == (said is None)
+    assert said is None or said in str(refusal)
+
+
+def test_a_correction_is_no_cause_and_answers_for_what_it_leaves_itself():
+    found = correction(heliostats=BETTER)
+    assert names_of(found) == ["correction (no cause)"]
+    assert open_questions(found) == []
