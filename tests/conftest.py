@@ -28,23 +28,28 @@ from benchmarks import data_folder
 from heliotwin.demo.plant import write_plant
 from model.mount import Mount
 from model.plant import Heliostat, TargetPlane
+from tests.quick_services import copied_schema, shared_routes, written_state
 from tests.undeclared import camera
 from tests.waiting import WAIT_LIMIT_S
 from tests.watched import NotWatchedError, environment, watching
 
 torch.set_num_threads(1)
 
+# Fixtures of the session belong here: two folders that import one have two of it, one in the other.
+__all__ = ["copied_schema", "shared_routes", "written_state"]
+
 OF_ONE_WORKER = (
-    "tests/docker/test_composition.py",
-    "tests/service/browser/",
-    "tests/test_wheel.py",
-    "tests/test_additions.py",
-    "tests/model/test_refinement.py",
-    "tests/docker/test_client.py",
-    "tests/service/web/test_page_texts.py",
+    # A container that starts or stops changes the network, and a browser then drops its requests.
+    ("tests/docker/test_composition.py", "tests/service/browser/"),
+    ("tests/test_wheel.py",),
+    ("tests/test_additions.py",),
+    ("tests/model/test_refinement.py",),
+    ("tests/docker/test_client.py",),
+    ("tests/service/web/test_page_texts.py",),
 )
-"""Files and folders whose tests share what is expensive to make: an image, a browser, an
-environment, a surface. The longest come first, and they come before all others.
+"""Files and folders whose tests share what is expensive to make (an image, a browser, an
+environment, a surface), or disturb each other. The longest come first, and they come before all
+others.
 """
 FULL = (
     "tests/docker/test_client.py",
@@ -78,7 +83,7 @@ class FileScheduling(LoadScopeScheduling):  # type: ignore[misc]
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return next((place for place in OF_ONE_WORKER if nodeid.startswith(place)), nodeid)
+        return next((places[0] for places in OF_ONE_WORKER if nodeid.startswith(places)), nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -104,8 +109,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     long = {item.path for item in items if item.get_closest_marker("full")}
 
     def order(item: pytest.Item) -> tuple[int, bool]:
-        places = (item.nodeid.startswith(place) for place in OF_ONE_WORKER)
-        place = next((n for n, is_it in enumerate(places) if is_it), len(OF_ONE_WORKER))
+        those = (item.nodeid.startswith(places) for places in OF_ONE_WORKER)
+        place = next((n for n, is_it in enumerate(those) if is_it), len(OF_ONE_WORKER))
         return place, item.path not in long
 
     items.sort(key=order)

@@ -28,6 +28,7 @@ from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app
 from tests.docker.engine import binary
 from tests.docker.files import drawn_expressions
+from tests.quick_services import write_state
 from tests.service.conftest import (
     QUIET,
     FakeOperations,
@@ -37,7 +38,6 @@ from tests.service.conftest import (
     properties_document,
     serving,
     tower_document,
-    write_state,
 )
 from tests.service.spots import photographs
 from tests.waiting import child_process, until

@@ -6,17 +6,10 @@ from pathlib import Path
 import pytest
 
 from tests.heliotwin.cli.motor_folder import write, write_measurement
-from tests.service.conftest import (
-    copied_schema,
-    postgres_url,
-    properties_document,
-    shared_routes,
-    tower_document,
-    written_state,
-)
+from tests.service.conftest import postgres_url, properties_document, tower_document
 from tests.service.spots import photographs
 
-__all__ = ["copied_schema", "folder", "postgres_url", "shared_routes", "written_state"]
+__all__ = ["folder", "postgres_url"]
 
 
 @pytest.fixture
