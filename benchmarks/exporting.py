@@ -22,7 +22,7 @@ from service import store
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.columns import now
 from service.store.database import Database
 from service.store.recovery.backup import images_of
@@ -51,7 +51,9 @@ def fill(settings: Settings, heliostats: int, photographs: int, size: int) -> No
             row = store.put_heliostat(session, f"H{number:05d}", properties_document(), place)[0]
             for one in range(photographs):
                 sun = Sun(azimuth_deg=5.0 * one, elevation_deg=30.0)
-                about = Photograph(target.name, "cropped", sun, f"{one}", now(), (31234.0, 45012.0))
+                about = IncomingPhotograph(
+                    target.name, "cropped", sun, f"{one}", now(), (31234.0, 45012.0)
+                )
                 kept = measurement_row(about, measured, target.id, None)
                 image = ImageRow(
                     sha256=images.put(rng.bytes(size)), media_type="image/png", size_bytes=size

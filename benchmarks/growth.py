@@ -33,7 +33,7 @@ from service.base.arrays import pack
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store import audit, record_retention, sizes
 from service.store.columns import Base, now
 from service.store.database import Database
@@ -179,7 +179,7 @@ class Filler:
     ) -> None:
         azimuth, elevation = float(self.rng.uniform(90, 270)), float(self.rng.uniform(5, 65))
         sun = Sun(azimuth_deg=azimuth, elevation_deg=elevation)
-        about = Photograph(
+        about = IncomingPhotograph(
             self.target.name, kind, sun, f"{200_000 + number}", at, (31234.0, 45012.0)
         )
         row = measurement_row(about, measured, self.target.id, None)

@@ -42,7 +42,7 @@ CONTENT: dict[str, dict[str, str]] = {
     "Trace flux": {
         "model.tracing.trace": "",
         "model.tracing.montecarlo.trace_montecarlo": "",
-        "model.tracing.Flux": "normalized",
+        "model.tracing.TracedFlux": "normalized",
         "model.tracing.Window": "",
         "model.metrics.flux_accuracy": "",
     },

@@ -206,9 +206,9 @@ def _is_record(annotation: ast.expr) -> bool:
 
 
 LIMITS = {
-    "lines of code": 54_381,
+    "lines of code": 54_400,
     "words that WORDS.md replaces": 0,
-    "names of two or more classes": 3,
+    "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions that return a bare tuple": 42,
     f"classes above {MAX_CLASS_LINES} lines": 1,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model.network.architecture import MAX_IMAGES
 from model.observation import Observation
 from model.plant import Heliostat, TargetPlane
-from training.render import Camera, CleanCamera, SceneSampler, observe, places
+from training.render import CleanCamera, RealCamera, SceneSampler, observe, places
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def make_cases(
     names: Sequence[str],
     field: Array,
     count: int,
-    camera: Camera | CleanCamera,
+    camera: RealCamera | CleanCamera,
     seed: int = 100,
 ) -> list[Case]:
     """Make ``count`` cases of surfaces (N, 4, 8, 8) [m] at random positions of a field.
@@ -93,7 +93,11 @@ def make_cases(
 
 
 def _case(
-    name: str, truth: Array, field: Array, camera: Camera | CleanCamera, rng: np.random.Generator
+    name: str,
+    truth: Array,
+    field: Array,
+    camera: RealCamera | CleanCamera,
+    rng: np.random.Generator,
 ) -> Case:
     scenes = SceneSampler()
     (heliostat,) = scenes.heliostats(field[rng.integers(len(field), size=1)], rng)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from model.network.architecture import NetworkConfig
-from training.render import Camera, SceneSampler
+from training.render import RealCamera, SceneSampler
 from training.surfaces import Augmentation, Partition, fold_of, split
 
 
@@ -38,7 +38,7 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     augmentation: Augmentation = field(default_factory=Augmentation)
     scenes: SceneSampler = field(default_factory=SceneSampler)
-    camera: Camera = field(default_factory=Camera)
+    camera: RealCamera = field(default_factory=RealCamera)
 
     def parts(self, names: Sequence[str]) -> Partition:
         """Indices in ``names`` of the heliostats for training, and of those for validation."""
@@ -56,7 +56,7 @@ class TrainConfig:
             "network": NetworkConfig,
             "augmentation": Augmentation,
             "scenes": SceneSampler,
-            "camera": Camera,
+            "camera": RealCamera,
         }
         for name, part in kinds.items():
             if values.get(name) is not None:

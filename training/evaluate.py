@@ -30,7 +30,7 @@ from training.cases import Case, make_cases
 from training.config import TrainConfig
 from training.figures import Figures, Outcome, markdown, median_error, outcomes_of, shown
 from training.methods import Method, always, by_network, by_refinement, held_out_of
-from training.render import Camera, CleanCamera, load_field
+from training.render import CleanCamera, RealCamera, load_field
 from training.surfaces import load_part
 
 Array = NDArray[np.float64]
@@ -232,7 +232,7 @@ def main() -> None:
             parser.error(
                 f"{network} has learnt from {', '.join(sorted(seen))}, which are to judge it"
             )
-    camera = CleanCamera() if arguments.camera == "clean" else Camera()
+    camera = CleanCamera() if arguments.camera == "clean" else RealCamera()
     cases = make_cases(surfaces, names, load_field(arguments.data), arguments.cases, camera)
     methods = compared(arguments.network, arguments.beside, default_prior().mean)
     evaluation = evaluate(

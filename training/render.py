@@ -259,7 +259,7 @@ class CameraImages(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Camera:
+class RealCamera:
     """The differences between photographs and traced flux: effects of the catalogue, and noise.
 
     A batch is photographed under ``n_conditions`` different conditions of haze, roughness and
@@ -403,7 +403,7 @@ def observe(
     heliostat: Heliostat,
     z: Array,
     setups: Sequence[Observation],
-    camera: Camera | CleanCamera,
+    camera: RealCamera | CleanCamera,
     rng: np.random.Generator,
 ) -> list[Observation]:
     """Photograph a heliostat with heights ``z`` (4, 8, 8) [m] at `places`."""
@@ -422,7 +422,7 @@ def render(
     images: int,
     field: Array,
     scenes: SceneSampler,
-    camera: Camera | None,
+    camera: RealCamera | None,
     device: torch.device,
     seed: int,
 ) -> Renderings:
@@ -434,7 +434,9 @@ def render(
     return take(scenes.setups(field, len(z), images, rng, device), z, camera, rng)
 
 
-def take(setups: Setups, z: Array, camera: Camera | None, rng: np.random.Generator) -> Renderings:
+def take(
+    setups: Setups, z: Array, camera: RealCamera | None, rng: np.random.Generator
+) -> Renderings:
     """Photographs of surfaces ``z`` (B, F, 8, 8) [m] with given geometry; see `render`."""
     device = setups.lift.device
     surfaces = torch.as_tensor(z, dtype=torch.float32, device=device)

@@ -30,7 +30,7 @@ from model.surface import control_points
 from model.tracing import Optics
 from training.config import TrainConfig
 from training.export import export_checked
-from training.render import Camera, Setups, draw_suns, take
+from training.render import RealCamera, Setups, draw_suns, take
 from training.train import Trainer, TrainingBatch, height_errors
 from training.type_prior import type_prior
 
@@ -166,7 +166,7 @@ class TypeRun(Trainer):
         return self._rendered(count, MAX_IMAGES, None, np.random.default_rng(0))
 
     def _rendered(
-        self, count: int, images: int, camera: Camera | None, rng: np.random.Generator
+        self, count: int, images: int, camera: RealCamera | None, rng: np.random.Generator
     ) -> TrainingBatch:
         z = draw_surfaces(self.scenes.prior, count, rng)
         with torch.no_grad():

@@ -15,7 +15,7 @@ from heliotwin.demo.photographs import (
     DEVIATION,
     IMAGES,
     RAYS,
-    Camera,
+    TargetCamera,
     write_photograph,
     write_plant_file,
 )
@@ -95,7 +95,7 @@ class Demonstrated:
         rng = np.random.default_rng(seed)
         latitude = float(self.description.plant.origin[0])
         marks = self.description.marks_of[self.target.name] == "l_brackets"
-        camera = Camera(self.target, latitude, self.description.optics, rays, marks)
+        camera = TargetCamera(self.target, latitude, self.description.optics, rays, marks)
         _copy_plant(self.file, self.description, root)
         for mirror in self.mirrors:
             progress(mirror.name)
@@ -140,7 +140,12 @@ def _copy_plant(file: Path, described: PlantDescription, root: Path) -> None:
 
 
 def _write_photographs(
-    root: Path, mirror: Heliostat, camera: Camera, z: Array, images: int, rng: np.random.Generator
+    root: Path,
+    mirror: Heliostat,
+    camera: TargetCamera,
+    z: Array,
+    images: int,
+    rng: np.random.Generator,
 ) -> None:
     taken = camera.photograph(mirror, z, images, rng)
     for index, (sun, frame) in enumerate(zip(taken.suns, taken.frames, strict=True)):

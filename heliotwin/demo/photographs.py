@@ -58,7 +58,7 @@ class Photographs:
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class TargetCamera:
     """What is photographed, and how.
 
     Attributes

@@ -15,8 +15,8 @@ from heliotwin.demo.photographs import (
     DEVIATION,
     IMAGES,
     RAYS,
-    Camera,
     Photographs,
+    TargetCamera,
     write_photograph,
 )
 from heliotwin.folder import write_json, write_surface
@@ -30,7 +30,7 @@ from model.tracing import Optics
 from service.base.fields import Sun
 from service.base.progress import Progress, no_progress
 from service.sources.paint_documents import measurement_json
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 
 Array = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def write_plant(
     """Write the demonstration's measurement folder, with true surfaces in ``H/Deflectometry``."""
     rng = np.random.default_rng(seed)
     plant, prior = Plant("demo", ORIGIN), default_prior()
-    camera = Camera(TARGET, float(ORIGIN[0]), Optics(), rays)
+    camera = TargetCamera(TARGET, float(ORIGIN[0]), Optics(), rays)
     write_json(root / "demo-tower-measurements.json", tower(plant))
 
     def take(number: int, mirror: Heliostat, z: Array, draws: np.random.Generator) -> None:
@@ -167,5 +167,5 @@ def _write_photographs(root: Path, number: int, name: str, taken: Photographs) -
         azimuth, elevation = sun_angles(sun)
         first, second = (round(float(steps)) for steps in motors)
         position = Sun.model_construct(azimuth_deg=float(azimuth), elevation_deg=float(elevation))
-        about = Photograph(TARGET.name, "raw", position, motor_position=(first, second))
+        about = IncomingPhotograph(TARGET.name, "raw", position, motor_position=(first, second))
         write_photograph(root / name, f"{number}{index:02d}", measurement_json(about), raw=frame)

@@ -212,7 +212,7 @@ def in_pixels(images: Array, rows: int, columns: int) -> Array:
     return np.asarray(down @ images @ across.T)
 
 
-class TracedFlux(NamedTuple):
+class AlignedFlux(NamedTuple):
     """Aligned setups and their flux (N, rows, columns) [W/m2]."""
 
     aligned: Aligned
@@ -393,7 +393,7 @@ class Forecaster:
         seen[places] = clipped_alike(forecasts[places], light, shares)
         return seen
 
-    def _trace(self, model: PlantModel) -> TracedFlux:
+    def _trace(self, model: PlantModel) -> AlignedFlux:
         """Align and trace; both results are cached while only later stages change."""
         self.between()
         geometry = _name(model.effects, ("geometry",))
@@ -408,7 +408,7 @@ class Forecaster:
         if light not in self._flux:
             with torch.no_grad():
                 self._flux = {light: aligned.flux(self.view)}
-        return TracedFlux(aligned, self._flux[light])
+        return AlignedFlux(aligned, self._flux[light])
 
 
 def _name(effects: Sequence[Effect], stages: tuple[Stage, ...]) -> str:

@@ -54,7 +54,7 @@ MAX_GRID = 2**25
 
 
 @dataclass(frozen=True, eq=False)
-class Flux:
+class TracedFlux:
     """Traced flux.
 
     Attributes
@@ -502,7 +502,7 @@ def trace(
     samples: int = 32,
     padding: float = 0.5,
     cones: Literal["mirror", "facet"] = "mirror",
-) -> Flux:
+) -> TracedFlux:
     """Trace the flux of every mirror of a scene.
 
     Parameters
@@ -552,7 +552,7 @@ def trace(
         parts,
     )
     power = (rays.power.sum(-1) * irradiance).view(-1, parts).sum(1)
-    return Flux(irradiance=image, spot=spot, center=center, power=power)
+    return TracedFlux(irradiance=image, spot=spot, center=center, power=power)
 
 
 def _of_parts(value: float | Tensor, parts: int) -> float | Tensor:

@@ -32,7 +32,7 @@ from service.base.validation_messages import not_json, place_of
 from service.sources.files import MAX_JSON_BYTES, MAX_JSON_VALUES, read_file
 from service.sources.heliostat_document import heliostat_from_json, is_heliostat_document
 from service.sources.paint_documents import azimuth_from_north
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.sources.schema import (
     CalibrationProperties,
     CylindricalReceiver,
@@ -110,10 +110,10 @@ class Measurement:
         """``heliostat/identifier``."""
         return f"{self.heliostat}/{self.identifier}"
 
-    def photograph(self, kind: ImageKind | None) -> Photograph:
+    def photograph(self, kind: ImageKind | None) -> IncomingPhotograph:
         """Metadata of the image of one kind; for None, motors and spot without an image."""
         motors = None if self.motor_position is None else self.motor_position.tolist()
-        return Photograph(
+        return IncomingPhotograph(
             target_name=self.target,
             kind=kind,
             sun=Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg),

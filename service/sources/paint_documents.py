@@ -11,7 +11,7 @@ from model.plant import Cylinder, Plant, TargetPlane
 from model.times import format_time
 from service.base.plant_facts import NO_FACTS, PlantFacts
 from service.base.receivers import receiver_to_json
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 
 STAC_VERSION = "1.1.0"
 """Version of https://github.com/radiantearth/stac-spec.
@@ -105,7 +105,7 @@ def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, object]:
     }
 
 
-def measurement_json(photograph: Photograph) -> dict[str, object]:
+def measurement_json(photograph: IncomingPhotograph) -> dict[str, object]:
     """``calibration-properties.json`` of a photograph."""
     document: dict[str, object] = {
         "target_name": photograph.target_name,

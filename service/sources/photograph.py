@@ -9,7 +9,7 @@ from service.base.fields import Sun
 
 
 @dataclass(frozen=True)
-class Photograph:
+class IncomingPhotograph:
     """Metadata of an incoming image; units as in `service.store.tables.MeasurementRow`.
 
     - ``kind`` is None if there is no image, only motors and a spot.

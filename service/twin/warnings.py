@@ -7,14 +7,14 @@ from numpy.typing import ArrayLike
 
 from model.ephemeris import SunContradiction, clock_faults
 from model.frames import sun_direction
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.tables import SUN_CONTRADICTS_TIME, MeasurementRow
 
 Warnings = list[dict[str, object]]
 
 
 def find_sun_contradictions(
-    photographs: Sequence[Photograph], origin: ArrayLike
+    photographs: Sequence[IncomingPhotograph], origin: ArrayLike
 ) -> list[SunContradiction | None]:
     """Compare the recorded suns with their positions at the recorded times.
 
@@ -36,7 +36,7 @@ def sun_warnings(contradiction: SunContradiction | None) -> Warnings:
     return [{"type": SUN_CONTRADICTS_TIME, "detail": contradiction.detail, **found}]
 
 
-def other_warnings(row: MeasurementRow, photograph: Photograph) -> Warnings:
+def other_warnings(row: MeasurementRow, photograph: IncomingPhotograph) -> Warnings:
     """Stored warnings except the sun's.
 
     There are none if ``photograph`` has another sun or target, because they depend on these.
@@ -47,7 +47,7 @@ def other_warnings(row: MeasurementRow, photograph: Photograph) -> Warnings:
 
 
 def sun_columns(
-    row: MeasurementRow, photograph: Photograph, contradiction: SunContradiction | None
+    row: MeasurementRow, photograph: IncomingPhotograph, contradiction: SunContradiction | None
 ) -> dict[str, object]:
     """The columns of a stored measurement that depend on its time and sun.
 

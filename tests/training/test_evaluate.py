@@ -16,7 +16,7 @@ from training.config import TrainConfig
 from training.evaluate import DISTANCES, REFINEMENT, SLOW, compared, draw, evaluate
 from training.figures import Figures, outcomes_of
 from training.methods import always, by_network, by_onnx, by_run, held_out_of
-from training.render import Camera, CleanCamera, load_field
+from training.render import CleanCamera, RealCamera, load_field
 from training.surfaces import fold_of, load_surfaces, split
 from training.train import Run
 
@@ -60,7 +60,7 @@ def test_the_first_of_many_cases_are_those_of_few(stj, surfaces, cases):
     again = make_cases(surfaces[:3], ["a", "b", "c"], load_field(stj), 2, CleanCamera())
     for first, second in zip(cases, again, strict=False):
         np.testing.assert_array_equal(first.observations[5].flux, second.observations[5].flux)
-    imperfect = make_cases(surfaces[:3], ["a", "b", "c"], load_field(stj), 1, Camera())[0]
+    imperfect = make_cases(surfaces[:3], ["a", "b", "c"], load_field(stj), 1, RealCamera())[0]
     np.testing.assert_array_equal(imperfect.observations[0].sun, cases[0].observations[0].sun)
     assert np.abs(imperfect.observations[0].flux - cases[0].observations[0].flux).sum() > 1
 

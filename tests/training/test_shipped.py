@@ -12,7 +12,7 @@ from training.cases import make_cases
 from training.config import TrainConfig
 from training.figures import Figures, outcomes_of
 from training.methods import always, by_onnx
-from training.render import Camera, CleanCamera, load_field
+from training.render import CleanCamera, RealCamera, load_field
 from training.surfaces import load_part
 
 BEST = Path(__file__).parents[2] / "training" / "configs" / "best.json"
@@ -21,7 +21,7 @@ COUNT = 14
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("camera", "max_mm"), [(CleanCamera(), 0.125), (Camera(), 0.145)])
+@pytest.mark.parametrize(("camera", "max_mm"), [(CleanCamera(), 0.125), (RealCamera(), 0.145)])
 def test_shipped_weights_predict_test_mirrors_as_well_as_it_is_said(stj, camera, max_mm):
     surfaces, names = load_part(stj, "test")
     cases = make_cases(surfaces, names, load_field(stj), COUNT, camera)

@@ -14,7 +14,7 @@ from model.network.architecture import NetworkConfig
 from model.surface import mirrored, split_canting
 from training.config import TrainConfig
 from training.prior import estimate
-from training.render import Camera, SceneSampler, load_field, render
+from training.render import RealCamera, SceneSampler, load_field, render
 from training.surfaces import (
     Augmentation,
     load_surfaces,
@@ -111,7 +111,8 @@ def test_fresh_samples_are_no_mixtures_of_the_measured_surfaces(surfaces):
 def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     field, device = load_field(stj), torch.device("cpu")
     first, again, other = (
-        render(surfaces[:3], 4, field, SceneSampler(), Camera(), device, seed) for seed in (1, 1, 2)
+        render(surfaces[:3], 4, field, SceneSampler(), RealCamera(), device, seed)
+        for seed in (1, 1, 2)
     )
     assert first.flux.shape == first.clipped.shape == (3, 4, 64, 64)
     assert first.setups.conditions().shape == (3, 4, 12)
@@ -120,7 +121,7 @@ def test_rendered_images_are_normalised_and_reproducible(surfaces, stj):
     assert not torch.equal(first.flux, other.flux)
 
 
-PERFECT = Camera(
+PERFECT = RealCamera(
     0.02, 0.0, gamma=1.0, compression=0.0, warp=0.0, background=0.0, noise=0.0, exposure=(0.9, 1.0)
 )
 
@@ -155,7 +156,7 @@ def test_what_a_camera_cuts_off_is_cut_off_of_guesses_too(surfaces, stj):
 
 
 def test_conditions_of_a_camera_stay_within_its_limits():
-    camera, rng = Camera(gamma=1.2, compression=1.0), np.random.default_rng(0)
+    camera, rng = RealCamera(gamma=1.2, compression=1.0), np.random.default_rng(0)
     conditions = [
         {e.name: effect_to_json(e)["parameters"] for e in camera.effects(0.5, rng)}
         for _ in range(200)

@@ -7,7 +7,7 @@ from model.frames import wgs84_to_enu
 from model.imaging import ImageKind
 from model.pointing import Weather
 from model.times import format_time
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.tables import NO_IMAGE, MeasurementRow
 
 
@@ -16,7 +16,7 @@ def spot_m(wgs84: Sequence[float] | None, origin: tuple[float, float, float]) ->
     return None if wgs84 is None else wgs84_to_enu(wgs84, origin).round(6).tolist()
 
 
-def submitted_metadata(photograph: Photograph) -> dict[str, object]:
+def submitted_metadata(photograph: IncomingPhotograph) -> dict[str, object]:
     """Metadata that was sent with an image, by paths of REST fields, as JSON values."""
     taken, motors = photograph.taken_at, photograph.motor_position
     return {
@@ -40,16 +40,16 @@ def stored_metadata(row: MeasurementRow) -> dict[str, object]:
     }
 
 
-def photograph_from_row(row: MeasurementRow) -> Photograph:
+def photograph_from_row(row: MeasurementRow) -> IncomingPhotograph:
     """The photograph of a stored measurement, as it could be sent."""
     return photograph_with_target(row, row.target.name)
 
 
-def photograph_with_target(known: Any, target_name: str) -> Photograph:
+def photograph_with_target(known: Any, target_name: str) -> IncomingPhotograph:
     """The photograph of an object with a measurement's columns, such as a history record."""
     motors = (known.motor_axis_1, known.motor_axis_2)
     spot, helios = known.focal_spot_wgs84, known.helios_spot_wgs84
-    return Photograph(
+    return IncomingPhotograph(
         target_name=target_name,
         kind=None if known.kind == NO_IMAGE else cast(ImageKind, known.kind),
         sun=known.sun,

@@ -17,7 +17,7 @@ from model.pointing import Weather
 from service import store
 from service.base.errors import ConflictError, GoneError, NotFoundError
 from service.base.fields import JsonObject
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.columns import now
 from service.store.photographs.correction_log import (
@@ -74,7 +74,7 @@ class PhotographChanges:
     excluded: bool | None = None
     without: tuple[str, ...] = ()
 
-    def of(self, row: MeasurementRow) -> Photograph:
+    def of(self, row: MeasurementRow) -> IncomingPhotograph:
         """The stored photograph with the changes applied."""
         names = ("target_name", "taken_at", "motor_position")
         stored = photograph_from_row(row)
@@ -210,7 +210,7 @@ class _Task:
     """A stored image to measure, with all that its flux depends on."""
 
     sha256: str
-    photograph: Photograph
+    photograph: IncomingPhotograph
     plane: JsonObject
     cameras: tuple[Camera, ...]
     origin: tuple[float, float, float]
@@ -249,7 +249,7 @@ class Prepared:
         self.suns |= dict(zip(map(_sun_key, lacking.compared), found, strict=True))
 
 
-def _sun_key(photograph: Photograph) -> tuple[object, ...]:
+def _sun_key(photograph: IncomingPhotograph) -> tuple[object, ...]:
     """What the contradiction of a photograph's sun and time depends on."""
     sun, weather = photograph.sun, photograph.weather
     return sun.azimuth_deg, sun.elevation_deg, photograph.taken_at, weather.temperature_c
@@ -270,7 +270,7 @@ class CorrectedColumns:
     """
 
     def __init__(self, session: Session, prepared: Prepared, is_trial: bool) -> None:
-        self.tasks, self.compared = dict[int, _Task](), list[Photograph]()
+        self.tasks, self.compared = dict[int, _Task](), list[IncomingPhotograph]()
         self.model = get_model(session)
         self._session, self._prepared, self._is_trial = session, prepared, is_trial
 
@@ -298,7 +298,7 @@ class CorrectedColumns:
         }
 
     def remeasured(
-        self, row: MeasurementRow, photograph: Photograph, target: TargetRow
+        self, row: MeasurementRow, photograph: IncomingPhotograph, target: TargetRow
     ) -> dict[str, object] | None:
         """The columns of an image that is re-measured; None if that is still to be done."""
         image = row.image
@@ -324,7 +324,7 @@ class CorrectedColumns:
         warnings = [*(known.columns["warnings"] or ()), *other_warnings(row, photograph)]
         return known.columns | {"target": target, "warnings": warnings or None}
 
-    def _contradiction(self, photograph: Photograph) -> SunContradiction | None:
+    def _contradiction(self, photograph: IncomingPhotograph) -> SunContradiction | None:
         """What contradicts a photograph's time; a trial leaves it for later."""
         key = _sun_key(photograph)
         if key in self._prepared.suns:

@@ -26,7 +26,7 @@ from service.base.errors import NotFoundError, StoreFullError, TooLargeError
 from service.base.metrics import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
 from service.sources.decode import Pixels
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.columns import now
 from service.store.photographs import image_retention
 from service.store.photographs.image_files import digest, media_type
@@ -64,7 +64,7 @@ class _Known:
 def ingest(
     runtime: Runtime,
     heliostat: str,
-    photograph: Photograph,
+    photograph: IncomingPhotograph,
     data: bytes,
     is_live: bool = True,
     sent_by: str | None = None,
@@ -118,7 +118,7 @@ def ingest(
 
 
 def store_position(
-    runtime: Runtime, heliostat: str, photograph: Photograph, sent_by: str | None = None
+    runtime: Runtime, heliostat: str, photograph: IncomingPhotograph, sent_by: str | None = None
 ) -> Added[MeasurementRow]:
     """Store motor positions and a spot without an image.
 
@@ -150,7 +150,7 @@ def store_position(
     return added
 
 
-def require_position(photograph: Photograph) -> None:
+def require_position(photograph: IncomingPhotograph) -> None:
     """Raise InvalidInputError if a measurement without an image lacks motors or spot."""
     if photograph.motor_position is None:
         raise InvalidInputError(
@@ -208,7 +208,7 @@ def _require_quota(session: Session, settings: Settings, sha256: str, size: int)
             )
 
 
-def _read(runtime: Runtime, heliostat: str, photograph: Photograph, data: bytes) -> _Known:
+def _read(runtime: Runtime, heliostat: str, photograph: IncomingPhotograph, data: bytes) -> _Known:
     sha256 = digest(data)
     with runtime.database.reading() as session:
         _require_quota(session, runtime.settings, sha256, len(data))
@@ -238,7 +238,7 @@ class MeasuredImage(NamedTuple):
 
 def measure_photograph(
     runtime: Runtime,
-    photograph: Photograph,
+    photograph: IncomingPhotograph,
     data: bytes,
     plane: TargetPlane,
     cameras: Sequence[Camera],
@@ -271,7 +271,7 @@ def measure_photograph(
 def measure_stored(
     runtime: Runtime,
     row: MeasurementRow,
-    photograph: Photograph,
+    photograph: IncomingPhotograph,
     twin: HeliostatContext,
     plane: TargetPlane,
 ) -> MeasuredImage:
@@ -283,7 +283,7 @@ def measure_stored(
 
 
 def measurement_row(
-    photograph: Photograph,
+    photograph: IncomingPhotograph,
     measured: MeasuredFlux,
     target_id: int,
     contradiction: SunContradiction | None,
@@ -328,7 +328,7 @@ def measurement_row(
 
 
 def position_row(
-    photograph: Photograph, target_id: int, contradiction: SunContradiction | None
+    photograph: IncomingPhotograph, target_id: int, contradiction: SunContradiction | None
 ) -> MeasurementRow:
     """Create the row of a measurement without an image, without heliostat and identifier."""
     row = measurement_row(

@@ -11,7 +11,7 @@ from model.times import format_time
 from service import store
 from service.base.arrays import to_json_value
 from service.base.errors import ConflictError, GoneError
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.keys import RESERVED
 from service.store.photographs.correction_log import list_corrections, note_change
@@ -56,7 +56,7 @@ class _Filled(NamedTuple):
 def receive(
     runtime: Runtime,
     heliostat: str,
-    photograph: Photograph,
+    photograph: IncomingPhotograph,
     data: bytes | None,
     is_live: bool = True,
     actor: str = RESERVED,
@@ -92,7 +92,7 @@ def _record_forced(runtime: Runtime, heliostat: str, row: MeasurementRow, actor:
             audit.record(session, actor, "measurement.forced", subject, reason=row.forced)
 
 
-def _fields(photograph: Photograph, twin: HeliostatContext) -> dict[str, object]:
+def _fields(photograph: IncomingPhotograph, twin: HeliostatContext) -> dict[str, object]:
     """Fields that may be filled, by REST names, as JSON values; None if unknown."""
     taken, corners = photograph.taken_at, photograph.corners
     known = {
@@ -106,7 +106,7 @@ def _fields(photograph: Photograph, twin: HeliostatContext) -> dict[str, object]
     return {name: to_json_value(value) for name, value in known.items()}
 
 
-def _assign(row: MeasurementRow, name: str, photograph: Photograph, value: Any) -> None:
+def _assign(row: MeasurementRow, name: str, photograph: IncomingPhotograph, value: Any) -> None:
     """Set a missing field of a stored measurement."""
     if name == "taken_at":
         row.taken_at = photograph.taken_at
@@ -143,7 +143,7 @@ def _differs(name: str, sent: Any, stored: Any) -> bool:
 
 
 def _require_same(
-    session: Session, twin: HeliostatContext, row: MeasurementRow, photograph: Photograph
+    session: Session, twin: HeliostatContext, row: MeasurementRow, photograph: IncomingPhotograph
 ) -> None:
     """Raise ConflictError if a known photograph came with different values.
 
@@ -177,7 +177,11 @@ def _require_same(
 
 
 def _fill(
-    runtime: Runtime, heliostat: str, present: MeasurementRow, photograph: Photograph, actor: str
+    runtime: Runtime,
+    heliostat: str,
+    present: MeasurementRow,
+    photograph: IncomingPhotograph,
+    actor: str,
 ) -> ReceivedPhotograph | None:
     """Fill a known photograph in one transaction; None if it was deleted meanwhile.
 
@@ -241,7 +245,9 @@ def _fill(
     return replace(done.received, row=row)
 
 
-def _changes_flux(twin: HeliostatContext, before: Photograph, after: Photograph) -> bool:
+def _changes_flux(
+    twin: HeliostatContext, before: IncomingPhotograph, after: IncomingPhotograph
+) -> bool:
     """Whether new corners, or the camera of a new time, change the flux.
 
     A measurement without an image has no flux.

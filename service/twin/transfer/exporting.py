@@ -33,7 +33,7 @@ from service.sources.paint_documents import (
     stac_item,
     tower_json,
 )
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.sources.plant_export import export_plant
 from service.store.columns import EPOCH
 from service.store.photographs.measurements import EXCLUDED
@@ -197,12 +197,12 @@ def _write_surface(
 
 def _photographs(
     rows: Sequence[MeasurementRow],
-) -> dict[str, list[tuple[MeasurementRow, Photograph]]]:
+) -> dict[str, list[tuple[MeasurementRow, IncomingPhotograph]]]:
     """Images by the photograph's name that they are written under.
 
     An image with metadata other than the first one's has its identifier instead.
     """
-    found: dict[str, list[tuple[MeasurementRow, Photograph]]] = {}
+    found: dict[str, list[tuple[MeasurementRow, IncomingPhotograph]]] = {}
     for row in rows:
         if row.reason != EXCLUDED:
             photograph, name = photograph_from_row(row), photograph_name(row)
@@ -211,7 +211,7 @@ def _photographs(
     return found
 
 
-def _known(photograph: Photograph) -> tuple[Any, datetime | None]:
+def _known(photograph: IncomingPhotograph) -> tuple[Any, datetime | None]:
     return measurement_json(photograph), photograph.taken_at
 
 
@@ -220,7 +220,7 @@ def _write_photograph(
     writer: _Writer,
     heliostat: str,
     identifier: str,
-    images: list[tuple[MeasurementRow, Photograph]],
+    images: list[tuple[MeasurementRow, IncomingPhotograph]],
     place: list[float],
 ) -> dict[str, str]:
     """Write a photograph with its item; return image files by measurement identifier."""

@@ -29,7 +29,7 @@ from service.base.progress import Progress, no_progress
 from service.sources.documents import IMAGE_KINDS
 from service.sources.files import read_file
 from service.sources.folder import MeasurementFolder, measured_heights
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.keys import RESERVED
 from service.twin.heliostats.metadata import photograph_with_target
 from service.twin.photographs.repeats import receive
@@ -141,7 +141,7 @@ def _import_heliostat(
         skipped[f"{name} surface"] = str(error)
     counts.update(_put_heliostat(runtime, folder, name, actor))
 
-    def put(key: str, photograph: Photograph, file: Path | None) -> None:
+    def put(key: str, photograph: IncomingPhotograph, file: Path | None) -> None:
         progress(key)
         try:
             counts[_put(runtime, name, photograph, file, actor)] += 1
@@ -239,7 +239,7 @@ def _measured_surface(folder: MeasurementFolder, name: str) -> store.NewSurface 
 
 
 def _put(
-    runtime: Runtime, heliostat: str, photograph: Photograph, file: Path | None, actor: str
+    runtime: Runtime, heliostat: str, photograph: IncomingPhotograph, file: Path | None, actor: str
 ) -> str:
     """Store an image, or a position without one; return the outcome to count."""
     data = None if file is None else read_file(file, runtime.settings.max_image_bytes)

@@ -39,7 +39,7 @@ from service.base.fields import (
     unique_keys,
 )
 from service.drawing.pictures import flux_picture
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.sources.schema import WeatherFields, paint_motors
 from service.store.listing import Order, Period
 from service.store.photographs.correction_log import newest_correction
@@ -358,10 +358,10 @@ def _wgs84(runtime: Runtime, place: Position | None) -> tuple[float, float, floa
     return latitude, longitude, altitude
 
 
-def _photograph(metadata: MeasurementIn, runtime: Runtime) -> Photograph:
+def _photograph(metadata: MeasurementIn, runtime: Runtime) -> IncomingPhotograph:
     helios = metadata.helios_spot_m
     used = helios if metadata.focal_spot_m is None else metadata.focal_spot_m
-    return Photograph(
+    return IncomingPhotograph(
         target_name=metadata.target,
         kind=None if metadata.kind == "none" else metadata.kind,
         sun=metadata.sun,

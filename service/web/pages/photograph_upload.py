@@ -27,7 +27,7 @@ from service.base.fields import (
     parse_moment,
 )
 from service.base.names import IDENTIFIER
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.requests import position_of
 from service.twin.photographs.repeats import ReceivedPhotograph, receive
@@ -86,7 +86,7 @@ def time_in_name(name: str, zone: str) -> datetime | None:
         return None
 
 
-def _photograph(runtime: Runtime, form: UploadForm, name: str) -> Photograph:
+def _photograph(runtime: Runtime, form: UploadForm, name: str) -> IncomingPhotograph:
     with runtime.database.reading() as session:
         zone = plant_time_zone(session, runtime.settings.time_zone)
         taken_at = time_in_name(name, zone) or form.in_utc(zone).taken_at
@@ -98,7 +98,9 @@ def _photograph(runtime: Runtime, form: UploadForm, name: str) -> Photograph:
             raise InvalidInputError("no time in the file's name; fill in the time, or the sun")
     stem = PurePath(name).stem
     identifier = stem if re.fullmatch(IDENTIFIER, stem) else None
-    return Photograph(form.target, form.kind, sun, external_id=identifier, taken_at=taken_at)
+    return IncomingPhotograph(
+        form.target, form.kind, sun, external_id=identifier, taken_at=taken_at
+    )
 
 
 def _store(runtime: Runtime, form: UploadForm, file: UploadFile, actor: str) -> UploadedFile:

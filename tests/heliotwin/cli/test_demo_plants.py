@@ -12,7 +12,7 @@ from rich.console import Console
 
 from heliotwin.cli import demo
 from heliotwin.demo.described import Demonstrated, write_southern_plant
-from heliotwin.demo.photographs import Camera
+from heliotwin.demo.photographs import TargetCamera
 from heliotwin.demo.plant import DRIVES, POSITIONS, TARGET
 from model.mount import Mount
 from model.plant import Heliostat
@@ -96,7 +96,7 @@ def test_data_and_plant_are_not_both_given(tmp_path: Path):
 @pytest.mark.full
 def test_photographs_of_two_mirrors_at_once_are_those_of_one_after_the_other():
     """`Camera.skip` draws what a mirror's photographs draw."""
-    camera = Camera(TARGET, 50.9, Optics(), rays=1000)
+    camera = TargetCamera(TARGET, 50.9, Optics(), rays=1000)
     place = np.array(POSITIONS["AB12"])
     mirror = Heliostat.juelich("AB12", place, 80.0, mount=Mount.juelich(DRIVES))
     taken, skipped = np.random.default_rng(1), np.random.default_rng(1)

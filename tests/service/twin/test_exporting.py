@@ -27,7 +27,7 @@ from service.base.arrays import pack
 from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.folder import read_folder, read_surface
-from service.sources.photograph import Photograph
+from service.sources.photograph import IncomingPhotograph
 from service.store.pointing.mounts import add_mount
 from service.store.surfaces.surface_versions import NewSurface
 from service.twin.heliostats.measurements import load_heliostat_context
@@ -285,7 +285,7 @@ def test_photograph_that_is_sent_again_is_known(
     exported: tuple[Path, dict[str, Any]], other: Runtime
 ):
     import_folder(other, read_folder(exported[0]))
-    photograph = Photograph(
+    photograph = IncomingPhotograph(
         "upper", "raw", Sun(**sun_at()), "3", datetime(2024, 6, 4, 9, 0, 0, 250000, tzinfo=UTC)
     )
     row, is_new = ingest(other, "AA39", photograph, jpeg(4))

@@ -116,6 +116,33 @@ def test_later_photographs_refuse_an_effect_without_its_end(
     assert alarms(hazy) == []
 
 
+def keep_correction(app: FastAPI) -> str:
+    """The path of a study of the first days that found what has no name."""
+    study = keep(app)
+    blur = {"kind": "blur", "name": "right", "value": 0.02, "of": None, "per": None}
+    gain = {"before": 0.90, "after": 0.95}
+    discrepancy = {"coefficients": [blur], "transfer": {"days": gain}, "explained_share": 0.8}
+    with app.state.runtime.database.writing() as session:
+        row = session.get_one(StudyRow, 1)
+        row.verdict = "unexplained"
+        row.report = report_of(verdict="unexplained") | {"discrepancy": discrepancy}
+    return study
+
+
+def test_adopted_correction_that_ended_gets_its_end(app: FastAPI, hazy: TestClient):
+    study = keep_correction(app)
+    assert hazy.post(f"{study}/adopt", json={}).status_code == 409
+    forced = {"force": True, "reason": "it is so"}
+    assert hazy.post(f"{study}/adopt", json=forced).status_code == 201
+    (alarm,) = alarms(hazy)
+    assert alarm["message"].startswith("correction makes 6 photographs since 2026-06-07 worse")
+    offer = alarm["offer"]
+    assert offer["body"] == {"until": {"correction": "2026-06-07"}}
+    assert hazy.request(offer["method"], offer["path"], json=offer["body"]).status_code == 201
+    assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
+    assert alarms(hazy) == []
+
+
 def test_adopted_effect_that_ended_raises_an_alarm_until_it_gets_its_end(
     app: FastAPI, hazy: TestClient
 ):
