@@ -42,6 +42,9 @@ Operator = Literal["transfer", "warp", "scale", "add", "heights", "light"]
 MAX_FACETS = 6
 """Largest number of facets that have separate components."""
 
+FINEST = 20
+"""Largest number of half waves of stripes over a target's width."""
+
 _STEP = 1e-4
 """Angle [rad] of the finite difference for the movement of beams with a mount's axis."""
 
@@ -251,6 +254,21 @@ def _pattern(spots: SpotImages) -> list[Array]:
     return [right[i] * up[j] for i in range(8) for j in range(8) if i + j > 0]
 
 
+def _fine_waves(place: Array) -> list[Array]:
+    return [np.cos(i * np.pi / 2 * (place + 1)) for i in range(1, FINEST + 1)]
+
+
+def _stripes(spots: SpotImages) -> list[Array]:
+    """Waves along each axis of the target, finer than those of patterns."""
+    return [wave for place in spots.on_target for wave in _fine_waves(place)]
+
+
+def _waver(spots: SpotImages) -> list[Array]:
+    """Movements of rows, which a camera reads one after the other."""
+    waves = _fine_waves(spots.on_target[1])
+    return [np.stack([wave, np.zeros_like(wave)], axis=1) for wave in waves]
+
+
 def _added(spots: SpotImages) -> list[Array]:
     right, up = spots.on_target
     waves = (spots.waves**2).sum(axis=0) * (spots.window / 6) ** 2
@@ -272,6 +290,10 @@ _WARPS = _components(
 )
 _SHADES = _components("1", "right, up, right2, right up, up2")
 _WAVES = _components("1", ", ".join(f"wave {i} {j}" for i in range(8) for j in range(8) if i + j))
+_STRIPES = _components(
+    "1", ", ".join(f"wave {i} {way}" for way in ("right", "up") for i in range(1, FINEST + 1))
+)
+_WAVER = _components("m", ", ".join(f"wave {i} up" for i in range(1, FINEST + 1)))
 _LIGHTS = _components("1", "even, to the right, upwards, to the rim, halo")
 
 IMAGE_KINDS = (
@@ -281,8 +303,10 @@ IMAGE_KINDS = (
     GenericKind("uneven_blur", "camera", "add", _UNEVEN, _uneven_blur),
     GenericKind("response", "camera", "scale", _CURVE, _responses),
     GenericKind("geometry", "geometry", "warp", _WARPS, _warps),
+    GenericKind("waver", "geometry", "warp", _WAVER, _waver, is_smooth=False),
     GenericKind("shading", "target", "scale", _SHADES, _shading),
     GenericKind("pattern", "target", "scale", _WAVES, _pattern, is_smooth=False),
+    GenericKind("stripes", "target", "scale", _STRIPES, _stripes, is_smooth=False),
     GenericKind("added_light", "added_light", "add", _LIGHTS, _added),
 )
 

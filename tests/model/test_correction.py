@@ -35,7 +35,9 @@ CAMERA = [
     entry("blur", "right", 0.02),
     entry("response", "slope", 0.3),
     entry("geometry", "barrel", 0.1),
+    entry("waver", "wave 9 up", 0.1),
     entry("shading", "right", 0.2),
+    entry("stripes", "wave 9 right", 0.2),
     entry("added_light", "halo", 0.1),
 ]
 

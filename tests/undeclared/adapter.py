@@ -73,8 +73,9 @@ def setups_of(made: MeasurementSet) -> list[Setup]:
             target_of(plan.target),
             plan.goal,
             identifier=f"{plan.heliostat.name}/{identifier}",
+            temperature_c=15 + 8 * plan.warmth if world.row_focus else None,
         )
-        for plan, identifier in zip(made.plans, made.identifiers, strict=True)
+        for plan, world, identifier in zip(made.plans, made.worlds, made.identifiers, strict=True)
     ]
 
 

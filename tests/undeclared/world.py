@@ -216,7 +216,7 @@ def barrel_distortion(level: int, names: Sequence[str], rng: np.random.Generator
 
 
 def row_focus(level: int, names: Sequence[str], rng: np.random.Generator) -> Drawn:
-    """The upper row of facets bends [1/m] with a temperature, per standard deviation."""
+    """The upper row of facets bends [1/m] with a recorded temperature, per standard deviation."""
     return {"row_focus": _sign(rng) * (0.0005, 0.001, 0.002)[level]}, {}
 
 
