@@ -24,6 +24,7 @@ from service.store.job_tables import KeyRow
 from service.store.tables import HeliostatRow
 from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app
+from tests.quick_services import write_state
 from tests.service.browser.browsing import (
     DESK,
     PHONE,
@@ -44,7 +45,6 @@ from tests.service.conftest import (
     properties_document,
     serving,
     tower_document,
-    write_state,
 )
 from tests.service.studies import SLOPE, study_row
 

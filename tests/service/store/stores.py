@@ -5,10 +5,10 @@ from datetime import UTC, datetime
 from sqlalchemy import URL
 
 from service.base.fields import Sun
-from service.twin.photographs.ingest import Photograph
+from service.sources.photograph import IncomingPhotograph
 from tests.service.conftest import sun_at
 
-PHOTOGRAPH = Photograph(
+PHOTOGRAPH = IncomingPhotograph(
     "lower", "flux", Sun(**sun_at()), taken_at=datetime(2024, 6, 1, 12, tzinfo=UTC)
 )
 

@@ -21,6 +21,7 @@ from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.prunings import PruningsIn, prune
 from service.jobs.worker import Worker
+from service.sources.photograph import IncomingPhotograph
 from service.store import audit, sizes
 from service.store.columns import now
 from service.store.database import Database
@@ -32,7 +33,7 @@ from service.store.photographs.image_files import ImageStore, digest
 from service.store.recovery.backup import back_up, restore
 from service.store.recovery.check import inspect_store
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.photographs.ingest import Photograph, ingest
+from service.twin.photographs.ingest import ingest
 from service.twin.plant import setup
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
@@ -78,7 +79,7 @@ def give_to_another(runtime: Runtime, heliostat: str, data: bytes) -> tuple[Meas
     return ingest(
         runtime,
         heliostat,
-        Photograph("lower", "flux", Sun(**sun_at()), forced="both have it"),
+        IncomingPhotograph("lower", "flux", Sun(**sun_at()), forced="both have it"),
         data,
     )
 
