@@ -28,11 +28,12 @@ TOLERANCE = 0.006
 effect have less (two tracers, resampling, surfaces of finite resolution).
 """
 
-MAX_LEFT = 2 / 3
-"""Largest share of that error that the effects found may leave for the verdict "effect".
+MAX_LEFT, MAX_LEFT_ON_SHEET = 0.2, 2 / 3
+"""Largest shares of that error that the effects found may leave for the verdict "effect".
 
-True effects leave up to 0.02 of pure light, but 0.4 of photographs of a target's sheet, whose marks
-move light about. So what imitates a true effect is found by what gains more.
+Of pure light true effects leave up to 0.02, and imitations 0.26 and more. Of photographs of a
+target's sheet, whose marks move light about, true effects leave up to 0.4: there an imitation is
+found by what gains more.
 """
 
 MIN_RIVAL = 0.1
@@ -251,7 +252,9 @@ class Study:
     @property
     def leaves_little(self) -> bool:
         """Whether the effects found leave so little that they may be the cause."""
-        is_little = self.unexplained_share <= MAX_LEFT or not self.has_unexplained_error
+        on_sheet = any(image.sheet_share for image in self.images)
+        most = MAX_LEFT_ON_SHEET if on_sheet else MAX_LEFT
+        is_little = self.unexplained_share <= most or not self.has_unexplained_error
         return bool(self.found) and is_little
 
     @property
