@@ -28,12 +28,12 @@ TOLERANCE = 0.006
 effect have less (two tracers, resampling, surfaces of finite resolution).
 """
 
-MAX_LEFT, MAX_LEFT_ON_SHEET = 0.2, 2 / 3
+MAX_LEFT, MAX_LEFT_OF_SEVERAL = 2 / 3, 0.2
 """Largest shares of that error that the effects found may leave for the verdict "effect".
 
-Of pure light true effects leave up to 0.02, and imitations 0.26 and more. Of photographs of a
-target's sheet, whose marks move light about, true effects leave up to 0.4: there an imitation is
-found by what gains more.
+True effects leave up to 0.02 of pure light, but 0.4 of photographs of a target's sheet, whose marks
+move light about. So what imitates a true effect is found by what gains more. Several effects
+together imitate nearly anything: of pure light such imitations leave 0.26 and more.
 """
 
 MIN_RIVAL = 0.1
@@ -253,7 +253,7 @@ class Study:
     def leaves_little(self) -> bool:
         """Whether the effects found leave so little that they may be the cause."""
         on_sheet = any(image.sheet_share for image in self.images)
-        most = MAX_LEFT_ON_SHEET if on_sheet else MAX_LEFT
+        most = MAX_LEFT if len(self.found) < 2 or on_sheet else MAX_LEFT_OF_SEVERAL
         is_little = self.unexplained_share <= most or not self.has_unexplained_error
         return bool(self.found) and is_little
 
