@@ -478,6 +478,7 @@ def try_field(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--heliostats", type=int, default=60)
     parser.add_argument("--each", type=int, default=24, help="photographs of a heliostat")
     parser.add_argument("--most", type=int, default=60, help="actions of a field")
@@ -485,7 +486,7 @@ def main() -> None:
     parser.add_argument("--strengths", nargs="+", default=["strong", "weak", "none"])
     options = parser.parse_args()
     results = dict[str, Result]()
-    for seed in range(options.seeds):
+    for seed in range(options.first_seed, options.first_seed + options.seeds):
         for word in options.strengths:
             result = results.setdefault(word, Result())
             with tempfile.TemporaryDirectory() as folder:
