@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 from model.camera_choice import CameraChoice, PhotographedMirror, choose_camera
 from model.plant_model import PlantModel
 from service import store
+from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     Array,
@@ -19,6 +20,7 @@ from service.twin.heliostats.measurements import (
     load_heliostat_context,
     to_observations,
 )
+from service.twin.plant.model_versions import declares_camera
 from service.twin.runtime.runtime import Runtime
 
 KINDS = ("flux", "flux-centered")
@@ -55,6 +57,13 @@ def find_camera(
         ]
         known.sort(key=lambda one: (one.z is None, -len(one.rows), one.twin.row.name))
         return choose_camera(list(map(_photographed, known[:_MIRRORS])), model, operations.predict)
+
+
+def read_camera_choice(session: Session) -> dict[str, object] | None:
+    """The newest result of the job `camera-choices`; None if cameras are declared."""
+    query = select(JobRow.result).where(JobRow.kind == "camera-choices", JobRow.state == "done")
+    newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
+    return None if declares_camera(session) else newest
 
 
 def _photographed(mirror: StoredMirror) -> PhotographedMirror:

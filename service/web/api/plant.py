@@ -4,7 +4,6 @@ from typing import Annotated, Literal, Self
 
 from fastapi import APIRouter, Depends, Response, status
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
@@ -25,12 +24,12 @@ from service.sources.documents import (
 from service.sources.plant_schema import CameraEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store import audit
-from service.store.job_tables import JobRow
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import ReceiverRow, TargetRow
+from service.twin.photographs.camera_choice import read_camera_choice
 from service.twin.plant import setup
-from service.twin.plant.model_versions import declares_camera, get_model
+from service.twin.plant.model_versions import get_model
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -216,13 +215,6 @@ def plant_out(session: Session) -> PlantOut:
         tower_size=None if row.tower is None else TowerSize(**row.tower),
         camera_choice=read_camera_choice(session),
     )
-
-
-def read_camera_choice(session: Session) -> dict[str, object] | None:
-    """The newest result of the job `camera-choices`; None if cameras are declared."""
-    query = select(JobRow.result).where(JobRow.kind == "camera-choices", JobRow.state == "done")
-    newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
-    return None if declares_camera(session) else newest
 
 
 def target_out(row: TargetRow) -> TargetOut:

@@ -23,9 +23,9 @@ from service.sources.plant_schema import FacetGridEntry, HeliostatTypeEntry
 from service.store import audit, keys
 from service.store.tables import MeasurementRow, PlantRow, ReceiverRow, TargetRow
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
+from service.twin.photographs.camera_choice import read_camera_choice
 from service.twin.plant import model_versions
 from service.twin.plant.model_versions import CameraAnswer
-from service.web.api.plant import read_camera_choice
 from service.web.auth.dependencies import ADMIN, OPERATE, READ, IdentityDep, RuntimeDep
 from service.web.responses.pages import go_to_job, render
 
