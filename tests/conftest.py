@@ -42,6 +42,7 @@ OF_ONE_WORKER = (
     # A container that starts or stops changes the network, and a browser then drops its requests.
     ("tests/docker/test_composition.py", "tests/service/browser/"),
     ("tests/test_wheel.py",),
+    ("tests/heliotwin/cli/test_demo_field.py",),
     ("tests/test_additions.py",),
     ("tests/model/test_refinement.py",),
     ("tests/docker/test_client.py",),
