@@ -393,6 +393,15 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
     assert (report["partly"], report["discrepancy"]) == ([], None)
 
 
+def test_several_effects_must_leave_less_of_pure_light_than_one(hazy):
+    found = study(hazy, JUELICH_MODEL, options=QUICK)
+    one = replace(found, after=0.7 * found.after + 0.3 * found.before)
+    assert 0.2 < one.unexplained_share < 2 / 3
+    several = replace(one, found=2 * one.found)
+    on_sheet = replace(several, images=[replace(p, sheet_share=1e-3) for p in several.images])
+    assert (one.verdict, several.verdict, on_sheet.verdict) == ("effect", "unexplained", "effect")
+
+
 @pytest.mark.full
 def test_what_no_candidate_explains_is_said(hazy):
     found = study(hazy, JUELICH_MODEL, options=replace(QUICK, candidates=("axis_tilt",)))
