@@ -51,10 +51,10 @@ def study(heliostats: Sequence[str] | None, since: datetime | None) -> Offer:
 
 
 def has_seen(study: StudyRow | None, until: datetime, heliostat: str | None = None) -> bool:
-    """Whether a study included photographs up to a time, and of a heliostat if one is given."""
+    """Whether a study included photographs up to a time, of a heliostat or else of several."""
     if study is None or study.last_taken_at is None or study.last_taken_at < until:
         return False
-    return heliostat is None or heliostat in study.heliostats
+    return len(study.heliostats) > 1 if heliostat is None else heliostat in study.heliostats
 
 
 def adopt(number: int, ends: Mapping[str, date]) -> Offer:
