@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import PIPE, Popen, run
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from urllib.request import urlopen
 
 import cv2
@@ -25,10 +25,11 @@ from heliotwin.cli import demo
 from heliotwin.folder import observations_of
 from heliotwin.folder_store import FolderStore
 from model.images import FLUX_WINDOW
+from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
 from service.base.settings import Settings
 from service.drawing.pictures import mirror_heights, of_peak
-from service.sources.folder import read_folder
+from service.sources.folder import MeasuredSurface, read_folder
 from service.store.tables import HeliostatRow, SurfaceRow
 from service.twin.runtime.runtime import Runtime
 
@@ -56,7 +57,9 @@ def draw(out: Path) -> None:
     finally:
         runtime.close()
     (seen,) = (o for o in found if o.identifier.startswith(IMAGE))
-    flux = demo._forecast(folder.plant.heliostats[NAME], seen, folder, (z, None))
+    heliostat = folder.plant.heliostats[NAME]
+    mirror = MeasuredSurface(control_points(heliostat, z), DEGREE)
+    flux = demo._forecast(heliostat, seen, folder.model, mirror)
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     accuracies = {h["heliostat"]: h["accuracy_refined"] for h in report["heliostats"]}
     positions = {name: h.position for name, h in folder.plant.heliostats.items()}
@@ -129,9 +132,11 @@ def draw_console(out: Path) -> None:
 
 @contextmanager
 def _served(store: Path) -> Iterator[str]:
-    """The address of a service on a store."""
+    """The address of a service on a store, by a link that names no folder of this machine."""
     serve = [sys.executable, "-m", "service", "serve", "--port", str(PORT), "--json"]
-    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(store)}
+    LINK.unlink(missing_ok=True)
+    LINK.symlink_to(store.resolve())
+    environment = os.environ | {"HELIOTWIN_DATA_DIR": str(LINK)}
     with Popen(serve, env=environment, stdout=PIPE) as service:
         try:
             assert service.stdout is not None
@@ -139,6 +144,7 @@ def _served(store: Path) -> Iterator[str]:
             yield f"http://127.0.0.1:{PORT}"
         finally:
             service.terminate()
+            LINK.unlink()
 
 
 def _take_page(path: str, name: str, height: int) -> None:
@@ -157,6 +163,7 @@ def _take_page(path: str, name: str, height: int) -> None:
 
 
 PORT = 8123
+LINK = Path(gettempdir()) / "heliotwin-data"
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo")
