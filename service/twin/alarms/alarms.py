@@ -25,7 +25,7 @@ from sqlalchemy.orm import Session
 from model.changes import LevelChange, find_changes
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
-from model.times import format_minute, format_time
+from model.times import format_minute
 from service import store
 from service.base.fields import From
 from service.base.settings import Settings
@@ -470,10 +470,7 @@ def _fallen(line: HeliostatOverview, settings: Settings) -> Iterator[Alarm]:
         f" those before with {fall.earlier:.0%}, by the same surface; by {fall.min_drop:.0%} at"
         f" least, and {allowed:.0%} is allowed"
     )
-    action = (
-        "look for what changed on its mirror, and predict its surface from photographs since"
-        f" {format_time(fall.until)} (POST /v1/jobs/predictions with since)"
-    )
+    action = "look for what changed, and predict its surface from photographs since then"
     size = fall.min_drop / max(allowed, 1e-6)
     yield Alarm("fell", line.name, fall.until, message, action, _fingerprint(fall.until, size))
 
