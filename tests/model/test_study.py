@@ -395,7 +395,7 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
 
 def test_several_effects_must_leave_less_of_pure_light_than_one(hazy):
     found = study(hazy, JUELICH_MODEL, options=QUICK)
-    one = replace(found, after=0.7 * found.after + 0.3 * found.before)
+    one = replace(found, after=(found.after + found.before) / 2)
     assert 0.2 < one.unexplained_share < 2 / 3
     several = replace(one, found=2 * one.found)
     on_sheet = replace(several, images=[replace(p, sheet_share=1e-3) for p in several.images])
