@@ -42,8 +42,8 @@ Operator = Literal["transfer", "warp", "scale", "add", "heights", "light"]
 MAX_FACETS = 6
 """Largest number of facets that have separate components."""
 
-FINEST = 20
-"""Largest number of half waves of stripes over a target's width."""
+FINE = range(1, 21)
+"""Numbers of half periods of stripes over a target's width."""
 
 _STEP = 1e-4
 """Angle [rad] of the finite difference for the movement of beams with a mount's axis."""
@@ -247,25 +247,24 @@ def _shading(spots: SpotImages) -> list[Array]:
     return [right, up, right**2, right * up, up**2]
 
 
+def _waves(place: Array, counts: range) -> list[Array]:
+    """Waves of so many half periods over the target's width."""
+    return [np.cos(i * np.pi / 2 * (place + 1)) for i in counts]
+
+
 def _pattern(spots: SpotImages) -> list[Array]:
-    right, up = (
-        [np.cos(i * np.pi / 2 * (place + 1)) for i in range(8)] for place in spots.on_target
-    )
+    right, up = (_waves(place, range(8)) for place in spots.on_target)
     return [right[i] * up[j] for i in range(8) for j in range(8) if i + j > 0]
-
-
-def _fine_waves(place: Array) -> list[Array]:
-    return [np.cos(i * np.pi / 2 * (place + 1)) for i in range(1, FINEST + 1)]
 
 
 def _stripes(spots: SpotImages) -> list[Array]:
     """Waves along each axis of the target, finer than those of patterns."""
-    return [wave for place in spots.on_target for wave in _fine_waves(place)]
+    return [wave for place in spots.on_target for wave in _waves(place, FINE)]
 
 
 def _waver(spots: SpotImages) -> list[Array]:
     """Movements of rows, which a camera reads one after the other."""
-    waves = _fine_waves(spots.on_target[1])
+    waves = _waves(spots.on_target[1], FINE)
     return [np.stack([wave, np.zeros_like(wave)], axis=1) for wave in waves]
 
 
@@ -290,10 +289,8 @@ _WARPS = _components(
 )
 _SHADES = _components("1", "right, up, right2, right up, up2")
 _WAVES = _components("1", ", ".join(f"wave {i} {j}" for i in range(8) for j in range(8) if i + j))
-_STRIPES = _components(
-    "1", ", ".join(f"wave {i} {way}" for way in ("right", "up") for i in range(1, FINEST + 1))
-)
-_WAVER = _components("m", ", ".join(f"wave {i} up" for i in range(1, FINEST + 1)))
+_STRIPES = _components("1", ", ".join(f"wave {i} {way}" for way in ("right", "up") for i in FINE))
+_WAVER = _components("m", ", ".join(f"wave {i} up" for i in FINE))
 _LIGHTS = _components("1", "even, to the right, upwards, to the rim, halo")
 
 IMAGE_KINDS = (
