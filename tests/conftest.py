@@ -43,10 +43,12 @@ OF_ONE_WORKER = (
     ("tests/docker/test_composition.py", "tests/service/browser/"),
     ("tests/test_wheel.py",),
     ("tests/heliotwin/cli/test_demo_field.py",),
+    ("tests/heliotwin/test_library.py",),
     ("tests/test_additions.py",),
     ("tests/model/test_refinement.py",),
     ("tests/docker/test_client.py",),
     ("tests/service/web/test_page_texts.py",),
+    ("tests/service/web/test_aim_plans.py",),
 )
 """Files and folders whose tests share what is expensive to make (an image, a browser, an
 environment, a surface), or disturb each other. The longest come first, and they come before all
@@ -110,8 +112,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     long = {item.path for item in items if item.get_closest_marker("full")}
 
     def order(item: pytest.Item) -> tuple[int, bool]:
-        those = (item.nodeid.startswith(places) for places in OF_ONE_WORKER)
-        place = next((n for n, is_it in enumerate(those) if is_it), len(OF_ONE_WORKER))
+        places = enumerate(OF_ONE_WORKER)
+        place = next((n for n, own in places if item.nodeid.startswith(own)), len(OF_ONE_WORKER))
         return place, item.path not in long
 
     items.sort(key=order)

@@ -20,7 +20,6 @@ from model.surface import control_points
 from service.sources.folder import read_folder
 from tests.service.command import heliotwin as command
 
-pytestmark = pytest.mark.xdist_group("library")  # one worker makes the plant
 NOON = datetime(2026, 6, 21, 11, 36, tzinfo=UTC)
 
 

@@ -33,8 +33,6 @@ from tests.service.sources.aim_plant import write_aim_plant
 from tests.service.web.pages import HTML
 from tests.waiting import until
 
-pytestmark = pytest.mark.xdist_group("aim plans")  # one worker makes the plant
-
 BODY = {
     "target": "main",
     "sun": {"azimuth_deg": 180, "elevation_deg": 55},
