@@ -245,17 +245,29 @@ class Study:
     def _excess_error(self, accuracy: Array, position_residuals: Array) -> float:
         """Mean error beyond noise, of shape and of position."""
         of_position = loss(position_residuals) - EXPECTED * self.has_position
-        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor) + max(
-            0.0, NAT * float(of_position.mean())
-        )
+        return self._shape_error(accuracy) + max(0.0, NAT * float(of_position.mean()))
+
+    def _shape_error(self, accuracy: Array) -> float:
+        """Mean error of shape beyond noise."""
+        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
 
     @property
     def leaves_little(self) -> bool:
-        """Whether the effects found leave so little that they may be the cause."""
+        """Whether the effects found leave so little that they may be the cause.
+
+        A target that moved or a motor that slipped explains no shape. So effects that change
+        shapes may also be the cause of the shapes alone.
+        """
         on_sheet = any(image.sheet_share for image in self.images)
         most = MAX_LEFT if len(self.found) < 2 or on_sheet else MAX_LEFT_OF_SEVERAL
+        of_shape = self._shape_error(self.accuracy_before)
+        explains_shape = (
+            of_shape > TOLERANCE
+            and not any(effect.only_moves for effect in self.effects)
+            and self._shape_error(self.accuracy_after) <= most * of_shape
+        )
         is_little = self.unexplained_share <= most or not self.has_unexplained_error
-        return bool(self.found) and is_little
+        return bool(self.found) and (is_little or explains_shape)
 
     @property
     def verdict(self) -> Verdict:

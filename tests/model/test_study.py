@@ -14,6 +14,7 @@ from model.covariates import RECORDED_TIME, covariates_of
 from model.effects import CATALOGUE, Effect
 from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
+from model.effects.encoder_offset import EncoderOffset
 from model.effects.facet_canting import FacetCanting
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
@@ -400,6 +401,17 @@ def test_several_effects_must_leave_less_of_pure_light_than_one(hazy):
     several = replace(one, found=2 * one.found)
     on_sheet = replace(several, images=[replace(p, sheet_share=1e-3) for p in several.images])
     assert (one.verdict, several.verdict, on_sheet.verdict) == ("effect", "unexplained", "effect")
+
+
+def test_spots_that_are_off_do_not_speak_against_what_changed_shapes(hazy):
+    found = study(hazy, JUELICH_MODEL, options=QUICK)
+    off = np.full_like(found.position_residuals_before, 99.0)
+    moved = replace(found, position_residuals_before=off, position_residuals_after=off)
+    of_position = replace(moved, effects=[EncoderOffset(first_deg={"AA23": 0.1})])
+    blurred = replace(moved, after=(moved.after + 3 * moved.before) / 4)
+    assert moved.unexplained_share > 2 / 3
+    assert moved.verdict == "effect"
+    assert (of_position.verdict, blurred.verdict) == ("unexplained", "unexplained")
 
 
 @pytest.mark.full
