@@ -187,6 +187,8 @@ def half_sizes(element: Element) -> Array:
         raise element.line.refuse(
             f"aperture {element.aperture[:20]!r} of a heliostat is not read; r, a rectangle, is"
         )
+    if not all(0.01 <= size <= 100 for size in element.size[:2]):
+        raise element.line.refuse("width and height of a heliostat's element must be 0.01 to 100 m")
     return np.array(element.size[:2]) / 2
 
 

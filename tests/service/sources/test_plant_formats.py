@@ -271,6 +271,7 @@ def test_small_soltrace_input_is_read(tmp_path: Path):
         ("0.9", "1.9", 7, "must be a number in [0, 1]"),
         ("ZROT\t0\tVIRTUAL", "ZROT\t9\tVIRTUAL", 10, "is not read"),
         ("r\t10", "h\t10", 12, "aperture 'h' of a heliostat is not read"),
+        ("r\t10", "r\t0", 12, "width and height"),
         ("p\t0.004\t0.004", "p\t0.004\t0.005", 12, "surface 'p' of a heliostat is not read"),
         ("200\t0\tr", "200\t30\tr", 12, "rolled about its normal"),
         ("r\t8", "c\t8", 15, "only receivers that are"),
