@@ -49,6 +49,7 @@ def study(
     """
     options = options or StudyOptions()
     _check(flux_images)
+    flux_images = [p.without_spikes() for p in flux_images]
     fitter = TrialFitter(flux_images, model, options)
     _check_own(flux_images, model, options)
     scopes = ScopeSearch(fitter)
