@@ -50,9 +50,10 @@ def without_spikes(image: Array) -> Array:
     """
     smooth = median_filter(image, AROUND)
     off, found = np.abs(image - smooth).ravel(), image.copy().ravel()
+    step = off[off > 0].min(initial=np.inf)  # of levels, where most pixels are cut at black
     for part in np.array_split(np.argsort(smooth, axis=None), LEVELS):
-        usual = np.quantile(off[part], 0.9) / norm.ppf(0.95)
-        spikes = part[off[part] > SPIKE * usual] if usual > 0 else part[:0]
+        usual = max(np.quantile(off[part], 0.9) / norm.ppf(0.95), step)
+        spikes = part[off[part] > SPIKE * usual]
         found[spikes] = smooth.ravel()[spikes]
     return found.reshape(image.shape)
 
