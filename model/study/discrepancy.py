@@ -339,6 +339,11 @@ class Discrepancy:
         return self.terms[0].choice.term.kind.lives_in if is_located else None
 
     @property
+    def n_coefficients(self) -> int:
+        """Number of coefficients of all terms."""
+        return sum(one.coefficients.size for one in self.terms)
+
+    @property
     def described(self) -> str:
         """The first term in words."""
         return self.terms[0].choice.term.described
