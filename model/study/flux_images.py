@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from model.covariates import slant_range
 from model.effects import Effect, Stage, effect_to_json, effects_of_stage
@@ -25,19 +26,17 @@ from model.pointing.mounts import CalibratedMount
 from model.pointing.spots import observe_angles
 from model.progress import nothing_between
 from model.setup import Setup
-from model.study.noise import black_lift, grain_variance, without_spikes
+from model.study.noise import AROUND, black_lift, grain_variance, hot_pixels
 from model.study.parameters import copied, copy_name
 from model.study.position import USUAL_RAD, whiten
 
 Array = NDArray[np.float64]
 
-MIN_DISC, MIN_SIDE = 10, 64
-"""Smallest numbers of pixels across the sun's disc and the image for which spikes are looked for:
-there nothing real looks like one.
-"""
+MIN_DISC = 10
+"""Smallest number of pixels across the sun's disc with which nothing real looks like a spike."""
 
-MIN_SPIKES = 1e-3
-"""Share of the light below which spikes remain: those of noise have up to half of it."""
+MIN_HOT = 1e-3
+"""Share of the light below which hot and dead pixels remain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class FluxImage:
     spot_shifts_rad : (2, K) [rad] or None
         Spot shifts, sidewards and upwards, by K independent deviations of the mount's calibration.
         The deviations are the same for all photographs of a heliostat.
-    spike_share : float [1]
+    hot_share : float [1]
         Share of the light that hot and dead pixels had added or taken.
     """
 
@@ -75,7 +74,7 @@ class FluxImage:
     sheet_share: float = 0.0
     spot_std_rad: float = USUAL_RAD
     spot_shifts_rad: Array | None = None
-    spike_share: float = 0.0
+    hot_share: float = 0.0
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -131,16 +130,6 @@ class FluxImage:
             self, setup=setup, spot_std_rad=observed.std_rad, spot_shifts_rad=observed.shared_rad
         )
 
-    def without_spikes(self) -> "FluxImage":
-        """Take hot and dead pixels from their neighbours, if the sun's disc covers many pixels."""
-        plane, shape = self.setup.plane, self.image.shape
-        pixel = max(plane.height / shape[0], plane.width / shape[1])
-        if min(shape) < MIN_SIDE or 2 * SOLAR_DISC * self.slant_range < MIN_DISC * pixel:
-            return self
-        image = without_spikes(np.asarray(self.image, dtype=np.float64))
-        share = float(np.abs(image - self.image).sum() / self.image.sum())
-        return replace(self, image=image, spike_share=share) if share > MIN_SPIKES else self
-
     def noise_share(self, window: float) -> float:
         """The error that grain and sheet alone cause, in a cut of side ``window`` [m]."""
         images, planes = np.stack([self.image, black_lift(self.image)]), [self.setup.plane] * 2
@@ -151,6 +140,29 @@ class FluxImage:
         lifted = lift - seen * lift.sum() / seen.sum()
         grain = np.sqrt(2 / np.pi * grain_variance(seen))
         return float(np.hypot(np.hypot(lifted, grain).sum() / seen.sum(), self.sheet_share))
+
+
+def without_hot_pixels(flux_images: Sequence[FluxImage]) -> list[FluxImage]:
+    """Give hot and dead pixels of each target's camera the median of their surroundings.
+
+    The sun's disc must cover many pixels. What has little light is left.
+    """
+    cameras: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    for row, one in enumerate(flux_images):
+        plane = one.setup.plane
+        pixel = max(plane.height / one.image.shape[0], plane.width / one.image.shape[1])
+        if 2 * SOLAR_DISC * one.slant_range >= MIN_DISC * pixel:
+            cameras.setdefault((plane.name, one.image.shape), []).append(row)
+    found = list(flux_images)
+    for rows in cameras.values():
+        images = [np.asarray(found[row].image, dtype=np.float64) for row in rows]
+        hot = hot_pixels(images)
+        for row, image in zip(rows, images, strict=True):
+            repaired = np.where(hot, median_filter(image, AROUND), image)
+            share = float(np.abs(repaired - image).sum() / image.sum())
+            if share > MIN_HOT:
+                found[row] = replace(found[row], image=repaired, hot_share=share)
+    return found
 
 
 def noise_floor(flux_images: Sequence[FluxImage], window: float) -> float:

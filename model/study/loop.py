@@ -10,7 +10,7 @@ from model.errors import InvalidInputError
 from model.forecast import align
 from model.plant_model import PlantModel
 from model.study.discrepancy import find_discrepancy
-from model.study.flux_images import FluxImage
+from model.study.flux_images import FluxImage, without_hot_pixels
 from model.study.halves import find_drifts
 from model.study.judging import paired_gain
 from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
@@ -54,7 +54,7 @@ def study(
     """
     options = options or StudyOptions()
     _check(flux_images)
-    flux_images = [p.without_spikes() for p in flux_images]
+    flux_images = without_hot_pixels(flux_images)
     fitter = TrialFitter(flux_images, model, options)
     _check_own(flux_images, model, options)
     scopes = ScopeSearch(fitter)

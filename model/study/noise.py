@@ -2,7 +2,7 @@
 
 Grain is what no smooth light explains. What is cut at black leaves no grain but a lift: where there
 is no light, noise below zero is lost and noise above it stays. Hot and dead pixels are no grain:
-their neighbours say what they should show (`without_spikes`).
+they are spikes at the same places of all photographs (`hot_pixels`).
 
 Notes
 -----
@@ -16,6 +16,8 @@ Notes
 
 Sources: Immerkaer (1996), doi:10.1006/cviu.1996.0060, and Tobin (1958), doi:10.2307/1907382.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,28 +36,37 @@ BLOCK = 9
 """Pixels a side over which the share of black ones is counted."""
 
 AROUND = 5
-"""Pixels a side of the surroundings whose median a spike takes: spikes of up to 3 x 3 are found."""
+"""Pixels a side of a spike's surroundings: spikes of up to 3 x 3 are found."""
 
 SPIKE = 6.0
 """Deviation from that median, in standard deviations, beyond which a pixel is a spike."""
+
+MIN_IMAGES = 4
+"""Smallest number of photographs that show which pixels are hot or dead."""
 
 LEVELS = 12
 """Number of parts of an image, by intensity, each with its own noise."""
 
 
-def without_spikes(image: Array) -> Array:
-    """The image (rows, columns) whose spikes have the median of their surroundings.
+def spikes(image: Array) -> NDArray[np.bool_]:
+    """Pixels (rows, columns) that are far from the median of their surroundings.
 
     Its light must be smooth over `AROUND` pixels.
     """
     smooth = median_filter(image, AROUND)
-    off, found = np.abs(image - smooth).ravel(), image.copy().ravel()
+    off, found = np.abs(image - smooth).ravel(), np.zeros(image.size, dtype=bool)
     step = off[off > 0].min(initial=np.inf)  # of levels, where most pixels are cut at black
     for part in np.array_split(np.argsort(smooth, axis=None), LEVELS):
         usual = max(np.quantile(off[part], 0.9) / norm.ppf(0.95), step)
-        spikes = part[off[part] > SPIKE * usual]
-        found[spikes] = smooth.ravel()[spikes]
+        found[part] = off[part] > SPIKE * usual
     return found.reshape(image.shape)
+
+
+def hot_pixels(images: Sequence[Array]) -> NDArray[np.bool_]:
+    """Pixels (rows, columns) that are `spikes` of most images; none of fewer than `MIN_IMAGES`."""
+    if len(images) < MIN_IMAGES:
+        return np.zeros(images[0].shape, dtype=bool)
+    return np.asarray(np.mean([spikes(image) for image in images], axis=0) > 0.5)
 
 
 def grain_variance(image: Array, spacing: int = SPACING) -> Array:

@@ -228,9 +228,9 @@ class Study:
         return noise_floor(self.images, self.window)
 
     @property
-    def spike_share(self) -> float:
+    def hot_share(self) -> float:
         """Mean share of the light of the images that hot and dead pixels had added or taken."""
-        return float(np.mean([image.spike_share for image in self.images]))
+        return float(np.mean([image.hot_share for image in self.images]))
 
     @property
     def unexplained_share(self) -> float:
