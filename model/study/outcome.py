@@ -9,13 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.covariates import covariates_of
 from model.effects import Always, Effect
 from model.metrics import flux_accuracies
 from model.site import Site
 from model.study.discrepancy import Discrepancy
 from model.study.flux_images import FluxImage, noise_floor
-from model.study.judging import BeforeAfter, Gain, rank_correlation
+from model.study.judging import BeforeAfter, Gain
 from model.study.parameters import ParameterVector, Term
 from model.study.pattern import Pattern, pattern_of
 from model.study.position import EXPECTED, NAT, is_known, loss
@@ -228,11 +227,6 @@ class Study:
         return noise_floor(self.images, self.window)
 
     @property
-    def hot_share(self) -> float:
-        """Mean share of the light of the images that hot and dead pixels had added or taken."""
-        return float(np.mean([image.hot_share for image in self.images]))
-
-    @property
     def unexplained_share(self) -> float:
         """Share of the error beyond noise that the effects found leave; zero if it is small."""
         first = self.excess_error
@@ -307,17 +301,3 @@ class Study:
     def has_unexplained_error(self) -> bool:
         """Whether more error is left than noise makes."""
         return self._error_left > TOLERANCE
-
-    def covariates(self) -> dict[str, float]:
-        """Rank correlations of the error that is left with covariates, the strongest first."""
-        error = 1 - self.accuracy_after
-        known = covariates_of([p.setup for p in self.images], self.site)
-        found = {
-            covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()
-        }
-        return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
-
-    def residual_map(self) -> Array:
-        """Mean of forecast minus measured (64, 64) with the effects found, in shares of peaks."""
-        peaks = self.measured.max(axis=(1, 2), keepdims=True)
-        return np.asarray(((self.after - self.measured) / peaks).mean(axis=0))

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from model.covariates import covariates_of
 from model.study.advice import photographs_to_distinguish
-from model.study.judging import gain_to_json
+from model.study.judging import gain_to_json, rank_correlation
 from model.study.outcome import Array, Candidate, Found, Study
 
 
@@ -18,9 +19,9 @@ def conclude(study: Study) -> str:
             f" {study.pattern.depth:.1%} of the light, at the same places of the target in all"
             " photographs."
         )
-    if study.hot_share:
+    if hot_share := float(np.mean([image.hot_share for image in study.images])):
         conclusion += (
-            f" Hot or dead pixels have {study.hot_share:.1%} of the light; the study took them"
+            f" Hot or dead pixels have {hot_share:.1%} of the light; the study took them"
             " from their neighbours. Repair or mask them in the camera."
         )
     if not study.n_in_sample:
@@ -74,6 +75,20 @@ def _position_in_words(study: Study) -> str:
     return f", and the light lies {error.after:.1f} mrad from where motors sent it{change}"
 
 
+def error_covariates(study: Study) -> dict[str, float]:
+    """Rank correlations of the error that is left with covariates, the strongest first."""
+    error = 1 - study.accuracy_after
+    known = covariates_of([p.setup for p in study.images], study.site)
+    found = {covariate.name: round(rank_correlation(error, v), 3) for covariate, v in known.items()}
+    return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
+
+
+def residual_map(study: Study) -> Array:
+    """Mean of forecast minus measured (64, 64) with the effects found, in shares of peaks."""
+    peaks = study.measured.max(axis=(1, 2), keepdims=True)
+    return np.asarray(((study.after - study.measured) / peaks).mean(axis=0))
+
+
 def study_to_json(study: Study) -> dict[str, Any]:
     """The report of DESIGN.md, section 7."""
     error, n_with_motors = study.position_error_mrad, int(study.has_position.sum())
@@ -109,7 +124,7 @@ def study_to_json(study: Study) -> dict[str, Any]:
             for candidate in study.candidates
         ],
         "residual": {
-            "covariates": study.covariates(),
+            "covariates": error_covariates(study),
             "pattern": {
                 "is_targets": bool(study.is_pattern),
                 "on_target": round(float(study.pattern.on_target), 4),
@@ -118,7 +133,7 @@ def study_to_json(study: Study) -> dict[str, Any]:
             },
             "sign": "forecast minus photograph",
             "mean_map_8x8": (
-                study.residual_map().reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist()
+                residual_map(study).reshape(8, 8, 8, 8).mean(axis=(1, 3)).round(4).tolist()
             ),
         },
     }

@@ -11,6 +11,7 @@ from model.effects import CATALOGUE, Parameter
 from model.study import Study, conclude
 from model.study.advice import photographs_to_distinguish
 from model.study.outcome import Found
+from model.study.report import residual_map
 from service.drawing.charts import Array, HeatMap, difference_map
 from service.drawing.discrepancy_chart import amount_charts
 from service.drawing.study_charts import accuracy_chart, pictures, scatters
@@ -137,7 +138,7 @@ def study_body(
     """
     chart, sides = accuracy_chart(study), (study.window, study.window)
     mean = "Mean of forecast minus photograph"
-    left = difference_map(mean, study.residual_map(), sides, "of peak", ends["mean_difference"])
+    left = difference_map(mean, residual_map(study), sides, "of peak", ends["mean_difference"])
     found = study.discrepancy
     discrepancy = None if found is None else found.to_json()
     return TEMPLATES.get_template("study.html").render(

@@ -48,6 +48,7 @@ from service.store.plant.geometry import (
 )
 from service.store.plant.removal import remove_heliostat, remove_receiver, remove_target
 from service.store.results import (
+    Studied,
     add_forecast,
     add_study,
     counts,
@@ -56,6 +57,7 @@ from service.store.results import (
     has_study_page,
     list_forecasts,
     list_plans,
+    list_studied,
     list_studies,
     newest_study,
     recent_forecasts,
@@ -86,6 +88,7 @@ __all__ = [
     "Change",
     "NewSurface",
     "Outdated",
+    "Studied",
     "Trust",
     "active_versions",
     "add_alias",
@@ -130,6 +133,7 @@ __all__ = [
     "list_measurements",
     "list_plans",
     "list_receivers",
+    "list_studied",
     "list_studies",
     "list_surfaces",
     "list_targets",

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
@@ -194,6 +194,19 @@ def get_study(session: Session, number: int, page: bool = False) -> StudyRow:
 def newest_study(session: Session) -> StudyRow | None:
     """The newest study; None without any."""
     return session.scalar(select(StudyRow).order_by(StudyRow.id.desc()).limit(1))
+
+
+class Studied(NamedTuple):
+    """Heliostats of a study, and its last photograph; None if its photographs have no times."""
+
+    heliostats: list[str]
+    last_taken_at: datetime | None
+
+
+def list_studied(session: Session) -> list[Studied]:
+    """What each study was of, the oldest first."""
+    query = select(StudyRow.heliostats, StudyRow.last_taken_at).order_by(StudyRow.id)
+    return [Studied(*row) for row in session.execute(query).tuples()]
 
 
 def has_study_page(session: Session, number: int) -> bool:

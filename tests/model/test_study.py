@@ -34,6 +34,7 @@ from model.study.judging import few_gain, paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
 from model.study.parameters import ParameterVector, Term
 from model.study.position import whiten
+from model.study.report import error_covariates
 from model.study.trials import TrialFitter
 from model.surface import control_points
 from tests.conftest import target
@@ -444,7 +445,7 @@ def test_what_no_candidate_explains_is_said(hazy):
     assert found.partly == []
     assert study_to_json(found)["discrepancy"]["lives_in"] in (None, "angle", "mirror")
     assert [c.name for c in found.candidates] == ["axis_tilt"]
-    assert set(found.covariates()) == {
+    assert set(error_covariates(found)) == {
         "sun elevation",
         "slant range",
         "solar time",
@@ -471,7 +472,7 @@ def test_what_remains_is_reported_alike_in_any_order_of_the_images(hazy):
     ):
         arrays = {name: getattr(found, name)[order] for name in ("measured", "before", "after")}
         permuted = replace(found, images=[found.images[place] for place in order], **arrays)
-        reported.append(permuted.covariates())
+        reported.append(error_covariates(permuted))
     assert reported[0] == reported[1] == reported[2]
     expected = np.corrcoef(rankdata(1 - found.accuracy_after), rankdata(known))[0, 1]
     assert reported[0]["slant range"] == pytest.approx(expected, abs=5e-4)
@@ -504,7 +505,7 @@ def test_an_error_that_grows_with_time_is_seen_where_times_were_recorded(hazy):
     days = covariates_of([p.setup for p in found.images], found.site)[RECORDED_TIME]
     days -= days.min()
     np.testing.assert_allclose(days, np.round(days))
-    assert found.covariates()["recorded time"] == pytest.approx(
+    assert error_covariates(found)["recorded time"] == pytest.approx(
         rank_correlation(1 - found.accuracy_after, days), abs=5e-4
     )
     assert RECORDED_TIME not in covariates_of(

@@ -583,7 +583,7 @@ def _camera(session: Session) -> Iterator[Alarm]:
 def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alarm]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
-    study = store.newest_study(session) if cameras else None
+    studies = store.list_studied(session) if cameras else []
     for change in cameras:
         since = datetime.combine(change.day, clock(), ZoneInfo(zone)).astimezone(UTC)
         if declared is None or since > declared.adopted_at:
@@ -599,7 +599,7 @@ def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str)
                 "look at the camera's exposure, focus and lens; study the photographs, or declare"
                 " the camera again",
                 f"{change.target} {change.figure} {way} {change.day:%Y-%m}",
-                offer=None if offers.has_seen(study, since) else offers.study(None, since),
+                offer=None if offers.has_seen(studies, since) else offers.study(None, since),
             )
 
 

@@ -138,7 +138,7 @@ class HeliostatFacts:
 
     ``study`` is the newest study's sentence about what the model lacks. ``usual_misfit`` [1] is the
     median of the field's active surfaces. ``alarms`` are its open alarms, and ``adopting`` is the
-    offer to adopt ``study``, which is of ``newest_study`` like that sentence.
+    offer to adopt that study. ``studies`` are all.
     """
 
     limit: float
@@ -154,7 +154,7 @@ class HeliostatFacts:
     epoch: Epoch | None = None
     alarms: Mapping[Reason, Alarm] = field(default_factory=dict)
     adopting: Offer | None = None
-    newest_study: StudyRow | None = None
+    studies: Sequence[store.Studied] = ()
 
     @cached_property
     def usual_accuracy(self) -> float:
@@ -312,9 +312,7 @@ def _offer(facts: HeliostatFacts, cause: LikelyCause) -> Offer | None:
             of_day = (at for at in taken if cause.day in (None, at.date()))
             last = max(of_day, default=None)
             of_field = cause.kind == "haze"
-            if last is None or offers.has_seen(
-                facts.newest_study, last, None if of_field else name
-            ):
+            if last is None or offers.has_seen(facts.studies, last, None if of_field else name):
                 return None
             changed = facts.fall.until if of_field and facts.fall is not None else last
             return offers.study(None, changed) if of_field else offers.study([name], None)
@@ -586,7 +584,7 @@ def read_facts(
         epoch,
         alarms,
         adopting if study is not None else None,
-        newest,
+        store.list_studied(session),
     )
 
 

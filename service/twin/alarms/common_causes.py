@@ -155,9 +155,8 @@ def _offer(session: Session, cause: CommonCause) -> Offer | None:
     if reasons <= {"moved", "pointing"}:
         names = {one.heliostat for one in cause.members if one.heliostat and one.offer}
         return offers.calibrate(sorted(names)) if names else None
-    if reasons & {"accuracy", "fell"} and not offers.has_seen(
-        store.newest_study(session), cause.last_at
-    ):
+    studies = store.list_studied(session)
+    if reasons & {"accuracy", "fell"} and not offers.has_seen(studies, cause.last_at):
         return offers.study(cause.heliostats, cause.first_at)
     return None
 

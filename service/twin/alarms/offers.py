@@ -1,13 +1,13 @@
 """Offers: requests of REST that do what an alarm or a cause asks for."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date, datetime, timedelta
 from typing import Annotated, Literal
 
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from service.store.tables import StudyRow
+from service.store import Studied
 from service.twin.photographs.batches import MOST_ENTRIES
 from service.twin.studies.study import MAX_STUDY_IMAGES
 
@@ -50,11 +50,14 @@ def study(heliostats: Sequence[str] | None, since: datetime | None) -> Offer:
     return _post(label, "/v1/jobs/studies", heliostats=names, images=images, **change)
 
 
-def has_seen(study: StudyRow | None, until: datetime, heliostat: str | None = None) -> bool:
+def has_seen(studies: Iterable[Studied], until: datetime, heliostat: str | None = None) -> bool:
     """Whether a study included photographs up to a time, of a heliostat or else of several."""
-    if study is None or study.last_taken_at is None or study.last_taken_at < until:
-        return False
-    return len(study.heliostats) > 1 if heliostat is None else heliostat in study.heliostats
+    return any(
+        one.last_taken_at is not None
+        and one.last_taken_at >= until
+        and (len(one.heliostats) > 1 if heliostat is None else heliostat in one.heliostats)
+        for one in studies
+    )
 
 
 def adopt(number: int, ends: Mapping[str, date]) -> Offer:
