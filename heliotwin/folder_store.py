@@ -20,6 +20,7 @@ from model.imaging import ImageKind
 from model.plant import Receiver
 from model.pointing.report import mount_from_json, sun_to_json
 from service import store
+from service.base.choices import Selection
 from service.base.errors import SKIPPED
 from service.base.fields import Sun
 from service.base.progress import Progress, no_progress
@@ -108,7 +109,7 @@ class FolderStore:
         query = select(row).where(row.heliostat_id == owner.id, row.identifier == row.external_id)
         return self.session.scalars(query.order_by(row.id).options(undefer(row.arrays))).all()
 
-    def photographs(self, heliostat: str) -> tuple[list[MeasurementRow], dict[str, str]]:
+    def photographs(self, heliostat: str) -> Selection[MeasurementRow]:
         """A heliostat's accepted photographs, and why others were refused, by identifier."""
         rows = self.measurements(heliostat)
         refused = {
@@ -119,7 +120,7 @@ class FolderStore:
         for row in rows:
             if (reason := self.refused.get(f"{heliostat}/{row.identifier}")) is not None:
                 refused[row.identifier] = reason
-        return [row for row in rows if row.accepted and row.kind != NO_IMAGE], refused
+        return Selection([row for row in rows if row.accepted and row.kind != NO_IMAGE], refused)
 
     def trace(
         self, heliostat: str, surface: MeasuredSurface | None, wanted: ForecastTarget

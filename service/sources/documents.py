@@ -237,14 +237,13 @@ def read_heliostat(
     return heliostat
 
 
-def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
-    """Tower base (3,) in WGS84, and planar targets, of PAINT's ``tower-measurements.json``.
+def read_targets(tower: Any) -> dict[str, TargetPlane]:
+    """Planar targets of PAINT's ``tower-measurements.json``.
 
     `read_receivers` reads the receivers.
     """
     where = "tower measurements"
-    origin = _tower_base(tower, where)
-    plant = Plant("", origin)
+    plant = Plant("", read_tower_base(tower))
     targets = {}
     for name, entry in _typed(tower).items():
         if entry["type"] == "planar":
@@ -263,11 +262,12 @@ def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
                     raise InvalidInputError(f"{where}, {name}, locator: {error}") from None
     if not targets:
         raise InvalidInputError(f"{where}: no target of type 'planar'")
-    return origin, targets
+    return targets
 
 
-def _tower_base(tower: Any, where: str) -> Array:
+def read_tower_base(tower: Any) -> Array:
     """The tower base (3,) in WGS84."""
+    where = "tower measurements"
     properties = get(tower, where, "power_plant_properties")
     return np.array(parse(TowerBase, properties, f"{where}, power_plant_properties").coordinates)
 
@@ -280,7 +280,7 @@ def read_receivers(tower: Any) -> dict[str, AnyReceiver]:
     are in the object ``receivers``, which exports have; they take the place of PAINT's.
     """
     where = "tower measurements"
-    plant = Plant("", _tower_base(tower, where))
+    plant = Plant("", read_tower_base(tower))
     surveyed = {
         name: entry
         for name, entry in _typed(tower).items()
@@ -373,7 +373,7 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
     )
 
 
-def read_item(item: Any, where: str) -> tuple[datetime | None, Weather]:
+def read_item(item: Any, where: str) -> ItemProperties:
     """Time and weather of a measurement from PAINT's STAC item.
 
     The time is in UTC if the item names no time zone. It is None if the item has only a period.
@@ -381,7 +381,7 @@ def read_item(item: Any, where: str) -> tuple[datetime | None, Weather]:
     properties = parse(ItemProperties, get(item, where, "properties"), where)
     if properties.taken_at is None and properties.start_datetime is None:
         raise InvalidInputError(f"{where}: datetime: must be an ISO 8601 time, got null")
-    return properties.taken_at, properties.weather
+    return properties
 
 
 def _sun_shape(declared: Any, where: str) -> SunShape:

@@ -358,7 +358,7 @@ def compute_results(runtime: Runtime, line: HeliostatOverview) -> dict[str, obje
     return columns
 
 
-def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     assert line.surface is not None
     with runtime.database.reading() as session:
         query = select(SurfaceRow.arrays).where(SurfaceRow.id == line.surface.id)
@@ -366,7 +366,7 @@ def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...
     return totals.deviation_mm, totals.uncertainty_mm
 
 
-def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     key = str(line.pending["accuracy"]).rpartition(" ")[0]  # without the newest photograph
     with runtime.database.reading() as session:
         state = session.get(HeliostatStateRow, line.id)
@@ -378,7 +378,7 @@ def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, .
     return found.rank.accuracy, found.rank.photographs, key, found.accuracies, fall
 
 
-def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     assert line.mounted is not None
     pointing = find_pointing(runtime, line.mounted)
     return (pointing and _POINTING.dump_python(pointing, mode="json"),)
@@ -389,7 +389,7 @@ class _StoredResult(NamedTuple):
 
     key: str
     columns: tuple[str, ...]
-    compute: Callable[[Runtime, HeliostatOverview], tuple[Any, ...]]
+    compute: Callable[[Runtime, HeliostatOverview], Sequence[Any]]
 
 
 _RESULTS = {

@@ -3,7 +3,7 @@
 A change applies to all images of the photograph.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import NamedTuple, TypeVar
@@ -238,7 +238,7 @@ class Prepared:
     """
 
     def __init__(self) -> None:
-        self.suns: dict[tuple[object, ...], SunContradiction | None] = {}
+        self.suns: dict[Hashable, SunContradiction | None] = {}
         self.measured: dict[int, _Remeasured] = {}
 
     def add(self, runtime: Runtime, lacking: "CorrectedColumns") -> None:
@@ -249,7 +249,7 @@ class Prepared:
         self.suns |= dict(zip(map(_sun_key, lacking.compared), found, strict=True))
 
 
-def _sun_key(photograph: IncomingPhotograph) -> tuple[object, ...]:
+def _sun_key(photograph: IncomingPhotograph) -> Hashable:
     """What the contradiction of a photograph's sun and time depends on."""
     sun, weather = photograph.sun, photograph.weather
     return sun.azimuth_deg, sun.elevation_deg, photograph.taken_at, weather.temperature_c
