@@ -199,7 +199,9 @@ def _read_photograph(
     points, degree = points_of(heliostat, surface)
     spot = plane.to_enu(measured.center_of_mass)
     taken_at = measurement.taken_at
-    setup = Setup(heliostat, points, measurement.sun, plane, spot, degree=degree, taken_at=taken_at)
+    setup = Setup(
+        heliostat, points, measurement.to_sun, plane, spot, degree=degree, taken_at=taken_at
+    )
     return _Photograph(measurement, plane, measured, operations.forecast(setup, folder.model))
 
 

@@ -304,7 +304,7 @@ def _store_measurements(
     for measurement, photograph, sun in zip(measurements, photographs, suns, strict=True):
         progress(measurement.key)
         target = targets[measurement.target]
-        row = position_row(replace(photograph, kind=None), target.id, sun)
+        row = position_row(measurement, target.id, sun)
         if photograph.kind is not None:
             file = measurement.images[photograph.kind]
             try:
@@ -325,7 +325,7 @@ def _store_measurements(
                 row.image_sha256 = image.sha256
                 image.height_px, image.width_px = pixels.shape[:2]
                 images[image.sha256] = image
-        row.heliostat_id, row.identifier = twin.row.id, measurement.identifier
+        row.heliostat_id, row.identifier = twin.row.id, measurement.external_id
         rows.append(row)
     with runtime.database.writing() as session:
         # Another heliostat may have the same image.

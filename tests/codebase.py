@@ -204,11 +204,11 @@ def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> 
 
 
 LIMITS = {
-    "lines of code": 54_412,
+    "lines of code": 54_404,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
-    "functions annotated -> tuple[..]": 51,
+    "functions annotated -> tuple[..]": 49,
     f"classes above {MAX_CLASS_LINES} lines": 1,
     "lines with latitude_deg": 17,
     "names of a forecast request's fields": 23,

@@ -5,7 +5,6 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 
 import json
 from dataclasses import dataclass, field, fields, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ from model.imaging import Camera, ImageKind
 from model.imaging.light import cameras_from_json
 from model.mount import Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane, require_cylinder_shape
-from model.pointing import Weather
 from model.sunshape import SHAPES, Buie, SunShape
 from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
@@ -64,66 +62,40 @@ SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "image/tiff": "tif", "image
 """File suffixes of images by media type; PAINT's are PNG."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """One calibration measurement.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measurement(IncomingPhotograph):
+    """One calibration measurement of a folder.
 
     Attributes
     ----------
-    identifier : str
-    heliostat, target : str
-    azimuth_deg, elevation_deg : float [deg]
-        Sun position; azimuth from north over east.
+    heliostat : str
+    external_id : str
+        Its name in the folder.
     spot : (3,) [m] or None
         Measured centroid in ENU: PAINT's UTIS, otherwise HeliOS.
-    spot_wgs84, helios_spot_wgs84 : tuple or None [deg, deg, m]
-        The same centroid in WGS84, and that by HeliOS.
-    motor_position : (2,) [steps] or None
     images : dict
         Files by kind.
-    taken_at : datetime or None
-        With time zone; from PAINT's STAC item ``ID-calibration-item-stac.json``, if there is one.
-    weather : Weather
-        From the properties, or from those of the STAC item.
     """
 
-    identifier: str
     heliostat: str
-    target: str
-    azimuth_deg: float
-    elevation_deg: float
+    external_id: str
+    kind: ImageKind | None = None
     spot: Array | None = None
-    spot_wgs84: tuple[float, float, float] | None = None
-    helios_spot_wgs84: tuple[float, float, float] | None = None
-    motor_position: Array | None = None
     images: dict[ImageKind, Path] = field(default_factory=dict)
-    taken_at: datetime | None = None
-    weather: Weather = field(default_factory=Weather)
 
     @property
-    def sun(self) -> Array:
+    def to_sun(self) -> Array:
         """Unit vector (3,) towards the sun."""
-        return sun_direction(self.azimuth_deg, self.elevation_deg)
+        return sun_direction(self.sun.azimuth_deg, self.sun.elevation_deg)
 
     @property
     def key(self) -> str:
-        """``heliostat/identifier``."""
-        return f"{self.heliostat}/{self.identifier}"
+        """``heliostat/external_id``."""
+        return f"{self.heliostat}/{self.external_id}"
 
     def photograph(self, kind: ImageKind | None) -> IncomingPhotograph:
         """Metadata of the image of one kind; for None, motors and spot without an image."""
-        motors = None if self.motor_position is None else self.motor_position.tolist()
-        return IncomingPhotograph(
-            target_name=self.target,
-            kind=kind,
-            sun=Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg),
-            external_id=self.identifier,
-            taken_at=self.taken_at,
-            motor_position=None if motors is None else (motors[0], motors[1]),
-            focal_spot_wgs84=self.spot_wgs84,
-            helios_spot_wgs84=self.helios_spot_wgs84,
-            weather=self.weather,
-        )
+        return replace(self, kind=kind)
 
 
 def get(data: Any, where: str, *keys: str | int) -> Any:
@@ -181,7 +153,7 @@ def _actuators(entries: Any, where: str) -> tuple[LinearActuator, LinearActuator
     if len(entries) != 2 or any(get(entry, where, "type_axis") != "linear" for entry in entries):
         return None
     axes = (parse(LinearAxis, entry, f"{where}, actuators") for entry in entries)
-    first, second = (LinearActuator(**axis.model_dump()) for axis in axes)
+    first, second = (axis.actuator() for axis in axes)
     return first, second
 
 
@@ -357,18 +329,21 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
             f" {', '.join(plant.targets)}"
         )
     spots, motors = document.focal_spot or FocalSpots(), document.motor_position
-    steps = motors and [motors.axis_1_motor_position, motors.axis_2_motor_position]
     spot = spots.HeliOS if spots.UTIS is None else spots.UTIS
     return Measurement(
-        identifier=identifier,
+        document.target_name,
+        sun=Sun(
+            azimuth_deg=azimuth_from_north(document.sun_azimuth),
+            elevation_deg=document.sun_elevation,
+        ),
+        external_id=identifier,
         heliostat=heliostat,
-        target=document.target_name,
-        azimuth_deg=azimuth_from_north(document.sun_azimuth),
-        elevation_deg=document.sun_elevation,
         spot=None if spot is None else plant.to_enu(np.array(spot)),
-        spot_wgs84=spot,
+        focal_spot_wgs84=spot,
         helios_spot_wgs84=spots.HeliOS,
-        motor_position=None if steps is None else np.array(steps),
+        motor_position=None
+        if motors is None
+        else (motors.axis_1_motor_position, motors.axis_2_motor_position),
         weather=document.weather,
     )
 

@@ -20,7 +20,7 @@ def submitted_metadata(photograph: IncomingPhotograph) -> dict[str, object]:
     """Metadata that was sent with an image, by paths of REST fields, as JSON values."""
     taken, motors = photograph.taken_at, photograph.motor_position
     return {
-        "target": photograph.target_name,
+        "target": photograph.target,
         "sun.azimuth_deg": photograph.sun.azimuth_deg,
         "sun.elevation_deg": photograph.sun.elevation_deg,
         "taken_at": None if taken is None else format_time(taken),
@@ -45,12 +45,12 @@ def photograph_from_row(row: MeasurementRow) -> IncomingPhotograph:
     return photograph_with_target(row, row.target.name)
 
 
-def photograph_with_target(known: Any, target_name: str) -> IncomingPhotograph:
+def photograph_with_target(known: Any, target: str) -> IncomingPhotograph:
     """The photograph of an object with a measurement's columns, such as a history record."""
     motors = (known.motor_axis_1, known.motor_axis_2)
     spot, helios = known.focal_spot_wgs84, known.helios_spot_wgs84
     return IncomingPhotograph(
-        target_name=target_name,
+        target=target,
         kind=None if known.kind == NO_IMAGE else cast(ImageKind, known.kind),
         sun=known.sun,
         external_id=known.external_id,

@@ -58,9 +58,9 @@ def reject_outliers(
     return Selection([o for row, o in enumerate(observations) if row not in apart], reasons)
 
 
-def _time(observation: Observation) -> tuple[bool, float]:
+def _time(observation: Observation) -> float:
     taken = observation.taken_at
-    return taken is not None, 0.0 if taken is None else taken.timestamp()
+    return -np.inf if taken is None else taken.timestamp()
 
 
 def list_outliers(misfits: Sequence[float], undated: int = 0) -> list[int]:

@@ -65,7 +65,7 @@ class PhotographChanges:
     """
 
     reason: str
-    target_name: str | None = None
+    target: str | None = None
     azimuth_deg: float | None = None
     elevation_deg: float | None = None
     taken_at: datetime | None = None
@@ -76,7 +76,7 @@ class PhotographChanges:
 
     def of(self, row: MeasurementRow) -> IncomingPhotograph:
         """The stored photograph with the changes applied."""
-        names = ("target_name", "taken_at", "motor_position")
+        names = ("target", "taken_at", "motor_position")
         stored = photograph_from_row(row)
         angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
         sun = {name: value for name, value in angles.items() if value is not None}
@@ -277,8 +277,8 @@ class CorrectedColumns:
     def of(self, row: MeasurementRow, changes: PhotographChanges) -> dict[str, object] | None:
         """The columns of a corrected image; None if it is not measured yet."""
         photograph, target, cameras = changes.of(row), row.target, self.model.cameras
-        if changes.target_name is not None:
-            target = store.get_target(self._session, changes.target_name)
+        if changes.target is not None:
+            target = store.get_target(self._session, changes.target)
         before = camera_at(cameras, row.target.name, row.taken_at)
         is_alike = (
             target is row.target and camera_at(cameras, target.name, photograph.taken_at) == before

@@ -136,7 +136,7 @@ def store_position(
     with runtime.database.reading() as session:
         twin, target = (
             load_heliostat_context(session, heliostat),
-            store.get_target(session, photograph.target_name),
+            store.get_target(session, photograph.target),
         )
     (contradiction,) = find_sun_contradictions([photograph], twin.origin)
     row = position_row(photograph, target.id, contradiction)
@@ -213,7 +213,7 @@ def _read(runtime: Runtime, heliostat: str, photograph: IncomingPhotograph, data
     with runtime.database.reading() as session:
         _require_quota(session, runtime.settings, sha256, len(data))
         twin = load_heliostat_context(session, heliostat)
-        target = store.get_target(session, photograph.target_name)
+        target = store.get_target(session, photograph.target)
         return _Known(
             twin,
             target.id,

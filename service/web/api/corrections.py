@@ -138,7 +138,7 @@ def patch_measurement(
     """
     changes = PhotographChanges(
         reason=correction.reason,
-        target_name=correction.target,
+        target=correction.target,
         **({} if correction.sun is None else correction.sun.model_dump()),
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,

@@ -367,7 +367,7 @@ def _photograph(metadata: MeasurementIn, runtime: Runtime) -> IncomingPhotograph
     helios = metadata.helios_spot_m
     used = helios if metadata.focal_spot_m is None else metadata.focal_spot_m
     return IncomingPhotograph(
-        target_name=metadata.target,
+        target=metadata.target,
         kind=None if metadata.kind == "none" else metadata.kind,
         sun=metadata.sun,
         external_id=metadata.id,

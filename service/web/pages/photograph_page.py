@@ -99,7 +99,7 @@ class CorrectionForm(Model):
         }
         return PhotographChanges(
             reason=self.reason,
-            target_name=given.get("target"),
+            target=given.get("target"),
             azimuth_deg=given.get("azimuth_deg"),
             elevation_deg=given.get("elevation_deg"),
             taken_at=given.get("taken_at"),

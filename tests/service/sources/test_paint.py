@@ -54,12 +54,12 @@ def test_motor_positions_agree_with_the_spot_to_about_a_degree(stj):
     """
     folder = read_folder(stj)
     heliostat = folder.plant.heliostats["AA39"]
-    measurement = next(m for m in folder.measurements("AA39") if m.identifier == "205363")
+    measurement = next(m for m in folder.measurements("AA39") if m.external_id == "205363")
     by_motor = heliostat.mount.attitude(
         heliostat.mount.angles_from_motors(measurement.motor_position)
     )
     by_spot = heliostat.mount.attitude(
-        heliostat.mount.align(heliostat.position, measurement.sun, measurement.spot)
+        heliostat.mount.align(heliostat.position, measurement.to_sun, measurement.spot)
     )
     assert np.degrees(np.arccos(by_motor[:, 2] @ by_spot[:, 2])) < 1.2
 
