@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import Any, NamedTuple, TypeVar
 
@@ -178,23 +178,8 @@ def _current_surfaces(
     if heliostat is not None:
         standing = standing.where(SurfaceRow.heliostat_id == heliostat)
     ranked = standing.subquery()
-    query = select(
-        SurfaceRow.heliostat_id,
-        SurfaceRow.is_candidate,
-        SurfaceRow.id,
-        SurfaceRow.version,
-        SurfaceRow.source,
-        SurfaceRow.valid_from,
-        SurfaceRow.misfit,
-        SurfaceRow.trusted,
-        SurfaceRow.warnings,
-        SurfaceRow.warned_since,
-        SurfaceRow.acknowledged_by,
-        SurfaceRow.acknowledged_at,
-        SurfaceRow.suspicious,
-        SurfaceRow.sun_span_deg,
-        SurfaceRow.created_at,
-    )
+    columns = (getattr(SurfaceRow, one.name) for one in fields(ActiveSurface))
+    query = select(SurfaceRow.heliostat_id, SurfaceRow.is_candidate, *columns)
     # The database selects them, because a plant has many versions and each refresh reads them.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
     active: dict[int, ActiveSurface] = {}

@@ -30,13 +30,19 @@ def submitted_metadata(photograph: IncomingPhotograph) -> dict[str, object]:
 
 def stored_metadata(row: MeasurementRow) -> dict[str, object]:
     """The same metadata of a stored measurement."""
-    motors = (row.motor_axis_1, row.motor_axis_2)
+    return submitted_metadata(photograph_from_row(row))
+
+
+def metadata_columns(photograph: IncomingPhotograph) -> dict[str, object]:
+    """Columns of a measurement's row that a correction may change, but for the target."""
+    motors = photograph.motor_position or (None, None)
     return {
-        "target": row.target.name,
-        "sun.azimuth_deg": row.sun_azimuth_deg,
-        "sun.elevation_deg": row.sun_elevation_deg,
-        "taken_at": None if row.taken_at is None else format_time(row.taken_at),
-        "motor_position": None if None in motors else list(motors),
+        "sun_azimuth_deg": photograph.sun.azimuth_deg,
+        "sun_elevation_deg": photograph.sun.elevation_deg,
+        "taken_at": photograph.taken_at,
+        "motor_axis_1": motors[0],
+        "motor_axis_2": motors[1],
+        **vars(photograph.weather),
     }
 
 

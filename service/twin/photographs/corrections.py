@@ -29,7 +29,7 @@ from service.store.photographs.image_files import digest
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
-from service.twin.heliostats.metadata import photograph_from_row, stored_metadata
+from service.twin.heliostats.metadata import metadata_columns, photograph_from_row, stored_metadata
 from service.twin.photographs.ingest import measure_photograph, measurement_row
 from service.twin.plant.model_versions import get_model
 from service.twin.runtime.runtime import Runtime
@@ -37,18 +37,10 @@ from service.twin.warnings import find_sun_contradictions, other_warnings, sun_c
 
 Done = TypeVar("Done")
 
-# Columns that a new measurement of the image changes: metadata, weather and measured values.
-_METADATA = (
-    "sun_azimuth_deg",
-    "sun_elevation_deg",
-    "taken_at",
-    "motor_axis_1",
-    "motor_axis_2",
-    "quality",
-    "warnings",
-)
 _WEATHER = tuple(weather.name for weather in fields(Weather))
-_MEASURED = ("accepted", "reason", "center_right_m", "center_up_m", "arrays")
+
+# Columns that a new measurement of the image changes, in addition to the metadata.
+_MEASURED = ("accepted", "reason", "quality", "warnings", "center_right_m", "center_up_m", "arrays")
 _PLANE = ("name", "geometry", "locator")
 
 
@@ -221,7 +213,8 @@ class _Task:
         _, flux = measure_photograph(runtime, self.photograph, data, plane, self.cameras)
         (contradiction,) = find_sun_contradictions([self.photograph], self.origin)
         row = measurement_row(self.photograph, flux, 0, contradiction)
-        return {name: getattr(row, name) for name in (*_METADATA, *_WEATHER, *_MEASURED)}
+        measured = {name: getattr(row, name) for name in _MEASURED}
+        return metadata_columns(self.photograph) | measured
 
 
 class _Remeasured(NamedTuple):
@@ -285,16 +278,10 @@ class CorrectedColumns:
         )
         if not is_alike and row.image is not None:
             return self.remeasured(row, photograph, target)
-        motors = photograph.motor_position or (None, None)
         return {
             "target": target,
-            "sun_azimuth_deg": photograph.sun.azimuth_deg,
-            "sun_elevation_deg": photograph.sun.elevation_deg,
-            "taken_at": photograph.taken_at,
-            "motor_axis_1": motors[0],
-            "motor_axis_2": motors[1],
+            **metadata_columns(photograph),
             **sun_columns(row, photograph, self._contradiction(photograph)),
-            **vars(photograph.weather),
         }
 
     def remeasured(
