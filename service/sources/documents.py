@@ -227,7 +227,7 @@ def read_targets(tower: Any) -> dict[str, TargetPlane]:
             ]
             targets[name] = TargetPlane.from_corners(name, *corners)
             if document.locator is not None:
-                located = document.locator.model_dump(exclude_none=True)
+                located = document.locator.locator_document
                 try:
                     targets[name] = targets[name].located_by(located)
                 except InvalidInputError as error:

@@ -475,7 +475,21 @@ class CameraEntry(PlantPart):
 Marks = Literal["none", "l_brackets"]
 
 
-class TargetEntry(PanelEntry):
+class LocatorDocument(PlantPart):
+    """How a target is located in photographs, in exports."""
+
+    marks: Marks
+    camera: CameraEntry | None = Field(
+        None, description="A camera that does not move; for targets without marks."
+    )
+
+    @property
+    def locator_document(self) -> dict[str, object]:
+        """What it declares of a target's place in photographs, as of `model.locating`."""
+        return self.model_dump(include={"marks", "camera"}, exclude_none=True)
+
+
+class TargetEntry(PanelEntry, LocatorDocument):
     """A calibration target."""
 
     kind: Literal["plane"]
@@ -484,21 +498,6 @@ class TargetEntry(PanelEntry):
         description="Marks at its corners that locate it in photographs. Without marks and camera"
         " its edges do, of a white rectangle against darker surroundings.",
     )
-    camera: CameraEntry | None = Field(
-        None, description="A camera that does not move; for targets without marks."
-    )
-
-    @property
-    def locator_document(self) -> dict[str, object]:
-        """What it declares of its place in photographs, as of `model.locating`."""
-        return self.model_dump(include={"marks", "camera"}, exclude_none=True)
-
-
-class LocatorDocument(PlantPart):
-    """How a target is located in photographs, in exports."""
-
-    marks: Marks
-    camera: CameraEntry | None = None
 
 
 class TowerEntry(PlantPart, TowerSize):

@@ -49,13 +49,15 @@ class NothingToChangeError(ConflictError):
 
 
 @dataclass(frozen=True)
-class PhotographChanges:
-    """Corrected metadata of a photograph; None leaves a value unchanged.
+class GivenCorrection:
+    """Corrected metadata of a heliostat's measurement; None leaves a value unchanged.
 
     ``excluded`` is whether the photograph is excluded from all computations. ``without``
     names metadata to remove: ``taken_at``, ``motor_position``.
     """
 
+    heliostat: str
+    identifier: str
     reason: str
     target: str | None = None
     azimuth_deg: float | None = None
@@ -79,15 +81,6 @@ class PhotographChanges:
         return replace(stored, weather=replace(stored.weather, **weather), **changes)
 
 
-@dataclass(frozen=True)
-class GivenCorrection:
-    """The corrected metadata of a heliostat's measurement."""
-
-    heliostat: str
-    identifier: str
-    changes: PhotographChanges
-
-
 class Corrected(NamedTuple):
     """The named image of a corrected photograph, and the new entries of its images' histories."""
 
@@ -96,12 +89,7 @@ class Corrected(NamedTuple):
 
 
 def correct_photograph(
-    runtime: Runtime,
-    heliostat: str,
-    identifier: str,
-    changes: PhotographChanges,
-    actor: str,
-    version: int | None = None,
+    runtime: Runtime, given: GivenCorrection, actor: str, version: int | None = None
 ) -> Corrected:
     """Correct or exclude the photograph of an image.
 
@@ -119,7 +107,6 @@ def correct_photograph(
     GoneError
         If an image must be re-measured, but is deleted.
     """
-    given = GivenCorrection(heliostat, identifier, changes)
     return correct_photographs(runtime, [given], actor, version)[0]
 
 
@@ -154,7 +141,7 @@ def remeasure(runtime: Runtime, heliostat: str, identifier: str, reason: str, ac
 
     def write(corrections: Corrections) -> bool:
         corrections.lock([heliostat])
-        given = GivenCorrection(heliostat, identifier, PhotographChanges(reason))
+        given = GivenCorrection(heliostat, identifier, reason)
         return bool(corrections.remeasure(given).history)
 
     return run_corrections(runtime, actor, write)
@@ -267,11 +254,11 @@ class CorrectedColumns:
         self.model = get_model(session)
         self._session, self._prepared, self._is_trial = session, prepared, is_trial
 
-    def of(self, row: MeasurementRow, changes: PhotographChanges) -> dict[str, object] | None:
+    def of(self, row: MeasurementRow, given: GivenCorrection) -> dict[str, object] | None:
         """The columns of a corrected image; None if it is not measured yet."""
-        photograph, target, cameras = changes.of(row), row.target, self.model.cameras
-        if changes.target is not None:
-            target = store.get_target(self._session, changes.target)
+        photograph, target, cameras = given.of(row), row.target, self.model.cameras
+        if given.target is not None:
+            target = store.get_target(self._session, given.target)
         before = camera_at(cameras, row.target.name, row.taken_at)
         is_alike = (
             target is row.target and camera_at(cameras, target.name, photograph.taken_at) == before
@@ -374,13 +361,13 @@ class Corrections:
         """Correct all images of a photograph; raises what `correct_photograph` raises."""
         row = self.find(given)
         images = images_of_photograph(self.session, row).values()
-        made = [self._write(given, one, self.columns.of(one, given.changes)) for one in images]
+        made = [self._write(given, one, self.columns.of(one, given)) for one in images]
         return Corrected(row, [entry for entry in made if entry is not None])
 
     def remeasure(self, given: GivenCorrection) -> Corrected:
         """Re-measure an image and correct it."""
         row = self.find(given)
-        columns = self.columns.remeasured(row, given.changes.of(row), row.target)
+        columns = self.columns.remeasured(row, given.of(row), row.target)
         entry = self._write(given, row, columns)
         return Corrected(row, [] if entry is None else [entry])
 
@@ -399,9 +386,9 @@ class Corrections:
         """Write changed columns with their history; None if none changed, or one may not."""
         if columns is None or self._is_trial:
             return None
-        has_flux, reason = "arrays" in columns, given.changes.reason
+        has_flux, reason = "arrays" in columns, given.reason
         before = _state(row, has_flux)
-        _assign(row, columns, given.changes.excluded)
+        _assign(row, columns, given.excluded)
         after = _state(row, has_flux)
         apart = [name for name, value in after.items() if value != before[name]]
         if not apart:
