@@ -115,7 +115,12 @@ def main() -> None:
                 continue
             spot = target.to_enu(taken.center_of_mass)
             setup = Setup(
-                folder.plant.heliostats["AA39"], points, one.sun, target, spot=spot, degree=degree
+                folder.plant.heliostats["AA39"],
+                points,
+                one.to_sun,
+                target,
+                spot=spot,
+                degree=degree,
             )
             found[share].append(
                 (taken.quality.cut_share, *accuracies(setup, plane, taken, folder.model.site))

@@ -44,7 +44,7 @@ def fill(settings: Settings, heliostats: int, photographs: int, size: int) -> No
     measured = MeasuredFlux(Quality(accepted=True), flux, flux[96:160, 96:160], np.zeros(2))
     with database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
-        target = store.put_target(session, read_targets(tower_document())[1]["lower"])[0]
+        target = store.put_target(session, read_targets(tower_document())["lower"])[0]
     for number in range(heliostats):
         with database.writing() as session:
             place = (float(number % 50), float(number // 50), 1.0)

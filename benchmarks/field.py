@@ -77,7 +77,7 @@ def fill(database: Database, count: int) -> None:
         store.put_plant(session, "plant", ORIGIN)
         targets = [
             store.put_target(session, plane)[0].id
-            for plane in read_targets(tower_document())[1].values()
+            for plane in read_targets(tower_document()).values()
         ]
     side = round(count**0.5)
     for numbers in _chunks(count):

@@ -34,7 +34,8 @@ def read_photographs(
 ) -> tuple[list[FluxImage], dict[str, str]]:
     """Photographs of a study with measured surfaces, and what is skipped, with the reasons."""
     with open_folder(folder, mounts_file=mounts) as opened:
-        return photographs_of(opened)
+        found = photographs_of(opened)
+    return found.photographs, found.skipped
 
 
 def read_readings(

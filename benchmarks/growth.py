@@ -133,7 +133,7 @@ class Filler:
     def plant(self) -> None:
         with self.database.writing() as session:
             store.put_plant(session, "plant", ORIGIN)
-            for plane in read_targets(tower_document())[1].values():
+            for plane in read_targets(tower_document()).values():
                 self.target = store.put_target(session, plane)[0]
             self.heliostats = [
                 store.put_heliostat(

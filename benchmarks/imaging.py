@@ -26,7 +26,7 @@ from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
 from model.imaging.light import LINEAR, Srgb
 from model.plant import Plant, TargetPlane
 from service.sources.decode import decode_image
-from service.sources.documents import read_json, read_targets
+from service.sources.documents import read_json, read_targets, read_tower_base
 from service.sources.juelich import mark_layouts
 
 TOWER = "WRI1030197-tower-measurements.json"
@@ -56,8 +56,8 @@ class Case:
 
 def read_plant(folder: Path) -> Plant:
     """The tower and its targets, from PAINT's tower measurements."""
-    origin, targets = read_targets(read_json(folder / TOWER))
-    return Plant("stj", origin, targets)
+    tower = read_json(folder / TOWER)
+    return Plant("stj", read_tower_base(tower), read_targets(tower))
 
 
 def read_case(properties: Path, plant: Plant) -> Case:

@@ -146,7 +146,7 @@ def _case(folder: MeasurementFolder, one: Measurement, points: Array, degree: in
     measured = {
         law: measure(image, "cropped", plane, camera=camera) for law, camera in CAMERAS.items()
     }
-    return Case(one.identifier, plane, one.taken_at, measured, forecasts)
+    return Case(one.external_id, plane, one.taken_at, measured, forecasts)
 
 
 def _forecasts(
@@ -158,7 +158,7 @@ def _forecasts(
 ) -> dict[float, Array]:
     """Light (256, 256) over the whole target by circumsolar ratio."""
     mirror, plane = folder.plant.heliostats[one.heliostat], folder.plant.targets[one.target]
-    setup = Setup(mirror, points, one.sun, plane, spot=one.spot, degree=degree)
+    setup = Setup(mirror, points, one.to_sun, plane, spot=one.spot, degree=degree)
     with torch.no_grad():
         aligned = align([setup], PlantModel(folder.model.site), dtype=torch.float64)
         traced = {
@@ -374,7 +374,7 @@ def differences() -> None:
             }
             taken["counts"] = measure(image, "flux", plane)
             forecast = {0.02: _forecasts(folder, one, *surface, ratios=(0.02,))[0.02]}
-            case = Case(one.identifier, plane, one.taken_at, taken, forecast)
+            case = Case(one.external_id, plane, one.taken_at, taken, forecast)
             rows[one.key] = {exposure: case.accuracy(str(exposure), 0.02) for exposure in exposures}
             plain[one.key] = case.accuracy("counts", 0.02)
     stretched = [exposure for exposure in exposures if exposure[1] == 1]
@@ -525,13 +525,13 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
     for case, one in zip(
         cases, (m for m in folder.measurements(heliostat) if "cropped" in m.images), strict=True
     ):
-        standing = outlines([mirror, *near], one.sun, aims)
+        standing = outlines([mirror, *near], one.to_sun, aims)
         field = Neighbours.from_outlines(
-            [Outlines([m.name for m in (mirror, *near)], standing, aims)], one.sun
+            [Outlines([m.name for m in (mirror, *near)], standing, aims)], one.to_sun
         )
         obstacles = torch.as_tensor(field.obstacles([heliostat]))
         plane = folder.plant.targets[one.target]
-        setup = Setup(mirror, points, one.sun, plane, one.spot, degree=degree)
+        setup = Setup(mirror, points, one.to_sun, plane, one.spot, degree=degree)
         free, shaded = (
             align_to_spots([setup], alter=alter).scene for alter in (None, _before(obstacles))
         )
@@ -547,15 +547,15 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
         )
         with_them = replace(case, forecasts={0.02: image}).accuracy("light", 0.02)
         figures = (
-            f"{one.elevation_deg:.0f} | {left:.2f} | {case.accuracy('light', 0.02):.3f} |"
+            f"{one.sun.elevation_deg:.0f} | {left:.2f} | {case.accuracy('light', 0.02):.3f} |"
             f" {with_them:.3f}"
         )
-        print(f"| {one.identifier} | {figures} |")
+        print(f"| {one.external_id} | {figures} |")
         log_row(
             "Photographs that neighbours may shade",
-            one.identifier,
+            one.external_id,
             {
-                "sun's elevation [degrees]": one.elevation_deg,
+                "sun's elevation [degrees]": one.sun.elevation_deg,
                 "light left [%]": 100 * left,
                 "accuracy without neighbours": case.accuracy("light", 0.02),
                 "accuracy with them": with_them,

@@ -236,7 +236,7 @@ def give(runtime: Runtime, root: Path, photographs: Sequence[PlannedPhotograph])
     wanted, rows = {str(one.number) for one in photographs}, []
     for name in sorted({one.mirror.name for one in photographs}):
         for one in folder.measurements(name):
-            if one.identifier in wanted:
+            if one.external_id in wanted:
                 (image,) = one.images.items()
                 photograph, data = one.photograph(image[0]), image[1].read_bytes()
                 rows.append((name, receive(runtime, name, photograph, data, actor="robot").row))

@@ -48,7 +48,7 @@ def apart_mrad(
 ) -> Array:
     """Angles (N,) [mrad] between recorded suns and where the sun was seen at the recorded times."""
     angles = sun_positions([moment for _, moment in measurements], folder.plant.origin)
-    recorded = np.array([one.sun for one, _ in measurements])
+    recorded = np.array([one.to_sun for one, _ in measurements])
     chords = np.linalg.norm(sun_direction(angles[:, 0], angles[:, 1]) - recorded, axis=1)
     return np.asarray(2e3 * np.arcsin(chords / 2))
 
@@ -59,7 +59,7 @@ def suns(folder: MeasurementFolder, measurements: Sequence[tuple[Measurement, da
     """
     apart, elevations = (
         apart_mrad(folder, measurements),
-        np.array([one.elevation_deg for one, _ in measurements]),
+        np.array([one.sun.elevation_deg for one, _ in measurements]),
     )
     print("| elevation [deg] | suns | median [mrad] | 95 % | largest |")
     print("| --- | --- | --- | --- | --- |")
@@ -84,7 +84,7 @@ def suns(folder: MeasurementFolder, measurements: Sequence[tuple[Measurement, da
             )
     moments = [moment for _, moment in measurements]
     flagged = clock_faults(
-        np.array([one.sun for one, _ in measurements]), moments, folder.plant.origin
+        np.array([one.to_sun for one, _ in measurements]), moments, folder.plant.origin
     )
     beyond = sum(one is not None for one in flagged)
     print(f"beyond the clock's tolerance of {TOLERANCE_DEG} degrees: {beyond}")

@@ -168,7 +168,7 @@ def places_of(years: MeasurementFolder, count: int) -> list[Observation]:
     """Suns and targets of AA39's photographs; nothing is seen yet."""
     blank, targets = np.ones(FLUX_SHAPE, np.float32), years.plant.targets
     setups = [
-        Observation(blank, m.sun, targets[m.target], targets[m.target].center, m.identifier)
+        Observation(blank, m.to_sun, targets[m.target], targets[m.target].center, m.external_id)
         for m in years.measurements("AA39")
     ]
     return spread(setups, count)

@@ -204,7 +204,7 @@ def timing() -> None:
     one = next(one for one in folder.measurements("AA39") if "cropped" in one.images)
     data, z = one.images["cropped"].read_bytes(), np.zeros((4, 8, 8))
     accepted = {one.identifier: one for one in read_accepted(folder, "AA39")}
-    observation = accepted[one.identifier].observation()
+    observation = accepted[one.external_id].observation()
 
     def measure() -> object:
         pixels = decode_image(data, max_pixels=10**8)

@@ -26,7 +26,7 @@ from model.plant import Heliostat
 from model.surface import split_canting
 from service import store
 from service.base.arrays import pair_or_none, unpack
-from service.base.choices import Method, require_images
+from service.base.choices import Method, Selection, require_images
 from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.sources.documents import optics_to_json, read_json
@@ -155,13 +155,11 @@ def write_gray(path: Path, image: NDArray[Any]) -> None:
 # --------------------------------------------------------------------------------------------------
 
 
-def observations_of(
-    opened: FolderStore, heliostat: str
-) -> tuple[list[Observation], dict[str, str]]:
+def observations_of(opened: FolderStore, heliostat: str) -> Selection[Observation]:
     """Observations of a heliostat, and the reasons of rejected images by identifier."""
     twin, (rows, refused) = opened.context(heliostat), opened.photographs(heliostat)
     evidence = [accepted_measurement(row, twin.origin) for row in rows]
-    return to_observations(evidence, twin.heliostat), refused
+    return Selection(to_observations(evidence, twin.heliostat), refused)
 
 
 def predict_heliostat(

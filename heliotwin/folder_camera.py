@@ -17,6 +17,7 @@ from model.imaging.light import Measured, Srgb, Transfer
 from model.imaging.measured_law import LitSheet, fit_law, lit_sheet
 from model.plant import Heliostat, TargetPlane
 from model.setup import Setup
+from service.base.choices import Selection
 from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.sources.decode import Pixels, decode_image
@@ -153,7 +154,7 @@ def _conclusion(report: dict[str, Any], is_better: bool) -> str:
 
 def _read_photographs(
     folder: MeasurementFolder, surfaces: str, targets: Collection[str], progress: Progress
-) -> tuple[list[_Photograph], dict[str, str]]:
+) -> Selection[_Photograph]:
     """Photographs with their forecasts, and skipped items with reasons."""
     photographs, skipped = [], dict[str, str]()
     for heliostat, surface in surfaces_of(folder, surfaces, skipped):
@@ -165,7 +166,7 @@ def _read_photographs(
                 photographs.append(_read_photograph(folder, heliostat, measurement, surface))
             except ModelError as error:
                 skipped[measurement.key] = str(error)
-    return photographs, skipped
+    return Selection(photographs, skipped)
 
 
 def read_image(path: Path) -> Pixels:
@@ -198,7 +199,9 @@ def _read_photograph(
     points, degree = points_of(heliostat, surface)
     spot = plane.to_enu(measured.center_of_mass)
     taken_at = measurement.taken_at
-    setup = Setup(heliostat, points, measurement.sun, plane, spot, degree=degree, taken_at=taken_at)
+    setup = Setup(
+        heliostat, points, measurement.to_sun, plane, spot, degree=degree, taken_at=taken_at
+    )
     return _Photograph(measurement, plane, measured, operations.forecast(setup, folder.model))
 
 

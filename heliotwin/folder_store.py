@@ -20,6 +20,7 @@ from model.imaging import ImageKind
 from model.plant import Receiver
 from model.pointing.report import mount_from_json, sun_to_json
 from service import store
+from service.base.choices import Selection
 from service.base.errors import SKIPPED
 from service.base.fields import Sun
 from service.base.progress import Progress, no_progress
@@ -108,7 +109,7 @@ class FolderStore:
         query = select(row).where(row.heliostat_id == owner.id, row.identifier == row.external_id)
         return self.session.scalars(query.order_by(row.id).options(undefer(row.arrays))).all()
 
-    def photographs(self, heliostat: str) -> tuple[list[MeasurementRow], dict[str, str]]:
+    def photographs(self, heliostat: str) -> Selection[MeasurementRow]:
         """A heliostat's accepted photographs, and why others were refused, by identifier."""
         rows = self.measurements(heliostat)
         refused = {
@@ -119,7 +120,7 @@ class FolderStore:
         for row in rows:
             if (reason := self.refused.get(f"{heliostat}/{row.identifier}")) is not None:
                 refused[row.identifier] = reason
-        return [row for row in rows if row.accepted and row.kind != NO_IMAGE], refused
+        return Selection([row for row in rows if row.accepted and row.kind != NO_IMAGE], refused)
 
     def trace(
         self, heliostat: str, surface: MeasuredSurface | None, wanted: ForecastTarget
@@ -303,7 +304,7 @@ def _store_measurements(
     for measurement, photograph, sun in zip(measurements, photographs, suns, strict=True):
         progress(measurement.key)
         target = targets[measurement.target]
-        row = position_row(replace(photograph, kind=None), target.id, sun)
+        row = position_row(measurement, target.id, sun)
         if photograph.kind is not None:
             file = measurement.images[photograph.kind]
             try:
@@ -324,7 +325,7 @@ def _store_measurements(
                 row.image_sha256 = image.sha256
                 image.height_px, image.width_px = pixels.shape[:2]
                 images[image.sha256] = image
-        row.heliostat_id, row.identifier = twin.row.id, measurement.identifier
+        row.heliostat_id, row.identifier = twin.row.id, measurement.external_id
         rows.append(row)
     with runtime.database.writing() as session:
         # Another heliostat may have the same image.

@@ -9,10 +9,11 @@ from heliotwin.folder import check_surfaces, predicted_from, surfaces_of
 from heliotwin.folder_store import FolderStore, open_folder
 from model.effects import Effect, effect_to_json
 from model.errors import InvalidInputError
-from model.study import FluxImage, Study, StudyOptions, study_to_json
+from model.study import Study, StudyOptions, study_to_json
 from service.base.errors import list_reasons
 from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasurementFolder, points_of
+from service.twin.studies.study import StudyInputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,36 +40,32 @@ class FolderStudy:
         }
 
 
-def photographs_of(
-    opened: FolderStore, surfaces: str = "measured"
-) -> tuple[list[FluxImage], dict[str, str]]:
+def photographs_of(opened: FolderStore, surfaces: str = "measured") -> StudyInputs:
     """Photographs of a folder for a study, and skipped heliostats and measurements with reasons."""
     seen, skipped = predicted_from(surfaces), opened.folder.skipped | opened.refused
-    inputs = opened.study_inputs(
+    return opened.study_inputs(
         (
             (one.name, *points_of(one, surface), seen.get(one.name, ()))
             for one, surface in surfaces_of(opened.folder, surfaces, skipped)
         ),
         skipped,
     )
-    return inputs.photographs, inputs.skipped
 
 
 def study_photographs(
     opened: FolderStore,
-    photographs: Sequence[FluxImage],
-    skipped: dict[str, str],
+    inputs: StudyInputs,
     options: StudyOptions | None = None,
     progress: Progress = no_progress,
 ) -> FolderStudy:
     """Find effects in photographs that the folder's model lacks; errors as of `study_folder`."""
     model = opened.model
     try:
-        found = opened.runtime.operations.study(photographs, model, options, progress)
+        found = opened.runtime.operations.study(inputs.photographs, model, options, progress)
     except InvalidInputError as error:
-        reasons = list_reasons(skipped, 5)
+        reasons = list_reasons(inputs.skipped, 5)
         raise InvalidInputError(f"{error}" + (f" ({reasons})" if reasons else "")) from None
-    return FolderStudy(found, skipped, model.effects, opened.clocks())
+    return FolderStudy(found, inputs.skipped, model.effects, opened.clocks())
 
 
 def study_folder(
@@ -92,4 +89,4 @@ def study_folder(
     with open_folder(
         folder, effects=effects, mounts_file=mounts, with_camera=False
     ) as opened:  # the camera is a candidate
-        return study_photographs(opened, *photographs_of(opened, surfaces), options, progress)
+        return study_photographs(opened, photographs_of(opened, surfaces), options, progress)

@@ -159,12 +159,12 @@ class PlantFolder:
         self.close()
 
     @property
-    def heliostats(self) -> tuple[str, ...]:
+    def heliostats(self) -> Sequence[str]:
         """Names of the heliostats."""
         return tuple(name for name in self._folder.plant.heliostats if name not in self.skipped)
 
     @property
-    def targets(self) -> tuple[str, ...]:
+    def targets(self) -> Sequence[str]:
         """Names of the targets and receivers."""
         return (*self._folder.plant.targets, *self._folder.plant.receivers)
 
@@ -447,7 +447,7 @@ class PlantFolder:
         ]
         inputs = store.study_inputs(mirrors, self.skipped | store.refused)
         options = StudyOptions(candidates=names)
-        report = study_photographs(store, inputs.photographs, inputs.skipped, options).to_json()
+        report = study_photographs(store, inputs, options).to_json()
         before, after = (report[name]["accuracy_mean"] for name in ("before", "after"))
         effects = report["effects"]
         return StudyResult(report["verdict"], report["conclusion"], effects, before, after, report)

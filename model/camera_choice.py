@@ -9,7 +9,6 @@ images is bent to explain a wrong camera, too. Therefore each camera has a separ
 the gain is a third of that by measured surfaces.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal, NamedTuple
@@ -25,7 +24,7 @@ from model.metrics import flux_accuracies
 from model.observation import Observation, SurfacePrediction, align_observations, common_side
 from model.plant import Heliostat
 from model.plant_model import PlantModel
-from model.study.judging import Gain, few_gain
+from model.study.judging import Gain, clustered_gain, few_gain
 
 Array = NDArray[np.float64]
 Answer = Literal["linear", "srgb", "undecided"]
@@ -133,7 +132,7 @@ def choose_camera(
         return None
     judged = [{name: _accuracies(one, model, name, predict) for name in _CURVES} for one in mirrors]
     pooled = {name: np.concatenate([one[name] for one in judged]) for name in _CURVES}
-    gain = _gain([one[_SRGB] - one[_LINEAR] for one in judged])
+    gain = clustered_gain([one[_SRGB] - one[_LINEAR] for one in judged])
     best = max(_CURVES, key=lambda name: float(pooled[name].mean()))
     over = few_gain(pooled[best] - pooled[_SRGB])
     is_other = best != _LINEAR and over.low > 0 and over.mean > _MIN_OTHER
@@ -168,18 +167,3 @@ def _accuracies(
     size = (wide, wide)
     cut = [flux_window(one, size, center_of_mass(one, size), side) for one in counts]
     return flux_accuracies(flux, np.array(cut))
-
-
-def _gain(by_mirror: Sequence[Array]) -> Gain:
-    """Mean gain over images with its 95 % interval; images of one mirror may err together.
-
-    Source: the cluster-robust variance of a mean, Liang and Zeger 1986.
-    """
-    gain, n_images = few_gain(np.concatenate(by_mirror)), sum(map(len, by_mirror))
-    if len(by_mirror) < 2 or gain.score == 0:
-        return gain
-    together = np.array([(one - gain.mean).sum() for one in by_mirror]) / n_images
-    error = math.sqrt(len(by_mirror) / (len(by_mirror) - 1) * float(together @ together))
-    wider = max(1.0, error * gain.score / gain.mean)
-    reach = wider * (gain.high - gain.mean)
-    return Gain(gain.mean, gain.mean - reach, gain.mean + reach, gain.score / wider)

@@ -11,7 +11,7 @@ Gradients with respect to an effect's parameters hold the alignment fixed.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -415,7 +415,7 @@ def align(
         If no attitude reflects the sun to a spot.
     """
     geometry = in_light_order(effects_of_stage(model.effects, "geometry"))
-    kinds: dict[tuple[tuple[object, ...], tuple[Effect, ...]], list[int]] = {}
+    kinds: dict[tuple[Hashable, tuple[Effect, ...]], list[int]] = {}
     for row, setup in enumerate(setups):
         kinds.setdefault(
             (setup.kind, acting(geometry, setup.taken_at, setup.heliostat.name)), []

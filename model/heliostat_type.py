@@ -6,7 +6,7 @@ focal lengths and a target-aligned mount depend on where it is and what it aims 
 Mirror coordinates are x to the right seen from the front, y up the mirror and z out of it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -164,7 +164,7 @@ class FacetDesign:
 
 def facet_grid(
     rows: int, columns: int, width: float, height: float, gap: float
-) -> tuple[FacetDesign, ...]:
+) -> Sequence[FacetDesign]:
     """Equal facets in rows and columns; from the upper left, row by row.
 
     ``width``, ``height`` and ``gap`` [m] are those of a facet and between two of them.
@@ -228,7 +228,7 @@ class HeliostatType:
     """
 
     name: str
-    facets: tuple[FacetDesign, ...]
+    facets: Sequence[FacetDesign]
     mount: MountDesign = field(default_factory=MountDesign)
     focus: Focus = "flat"
     canting: Canting = Canting()

@@ -138,7 +138,7 @@ class SurfacePrediction:
         return float(np.mean(self.misfits))
 
     @property
-    def suspicious(self) -> tuple[str, ...]:
+    def suspicious(self) -> Sequence[str]:
         """Identifiers of the images that the surface does not explain."""
         return tuple(
             name

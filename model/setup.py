@@ -1,5 +1,6 @@
 """The geometry of one measurement or forecast: a heliostat, a sun and a target."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -65,6 +66,6 @@ class Setup:
         return np.asarray(self.plane.center if chosen is None else chosen, dtype=np.float64)
 
     @property
-    def kind(self) -> tuple[object, ...]:
+    def kind(self) -> Hashable:
         """What setups must have in common to be aligned at once."""
         return (self.degree, *self.control_points.shape, self.spot is None)

@@ -166,10 +166,14 @@ def wide_functions() -> list[str]:
     ]
 
 
-def bare_tuples() -> list[str]:
-    """Functions that return a tuple of different things without names."""
+def tuple_functions() -> list[str]:
+    """Functions and methods that are annotated to return a tuple, of any length."""
     return [
-        d.place for d in _functions() if d.node.returns is not None and _is_record(d.node.returns)
+        d.place
+        for d in definitions()
+        if not isinstance(d.node, ast.ClassDef)
+        and d.node.returns is not None
+        and ast.unparse(d.node.returns).startswith("tuple[")
     ]
 
 
@@ -199,18 +203,12 @@ def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> 
     return sum(argument.arg not in ("self", "cls") for argument in names)
 
 
-def _is_record(annotation: ast.expr) -> bool:
-    """Whether it is a tuple of fixed length; ``tuple[X, ...]`` of like things is a sequence."""
-    text = ast.unparse(annotation).removesuffix(" | None")
-    return text.startswith("tuple[") and not text.endswith(", ...]")
-
-
 LIMITS = {
-    "lines of code": 54_412,
+    "lines of code": 54_344,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
-    "functions that return a bare tuple": 42,
+    "functions annotated -> tuple[..]": 49,
     f"classes above {MAX_CLASS_LINES} lines": 1,
     "lines with latitude_deg": 17,
     "names of a forecast request's fields": 23,
@@ -226,7 +224,7 @@ def count_all() -> dict[str, int]:
         old_words().total(),
         len(repeated_classes()),
         len(wide_functions()),
-        len(bare_tuples()),
+        len(tuple_functions()),
         len(long_classes()),
         lines_with("latitude_deg"),
         len(request_names()),
@@ -256,7 +254,7 @@ def details() -> str:
         ],
         "wide functions": wide_functions(),
         "long classes": long_classes(),
-        "bare tuples": bare_tuples(),
+        "functions that return tuples": tuple_functions(),
     }
     return "\n\n".join("\n".join([f"# {name}", *lines]) for name, lines in blocks.items())
 

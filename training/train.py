@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -160,7 +161,7 @@ class Trainer(ABC):
         torch.save(state, self.folder / "checkpoint.tmp")
         (self.folder / "checkpoint.tmp").replace(self.folder / "checkpoint.pt")
 
-    def inputs(self, photographs: Renderings, guess: Tensor) -> tuple[Tensor, ...]:
+    def inputs(self, photographs: Renderings, guess: Tensor) -> Sequence[Tensor]:
         """Return the network's inputs for photographs of B mirrors and guesses (B, F, 8, 8) [m]."""
         # Geometry needs more than sixteen bits: all of it is outside of autocast.
         with torch.no_grad():

@@ -36,7 +36,7 @@ from model.plant_model import PlantModel
 from model.setup import Setup
 from model.surface import DEGREE, control_points
 from service.base.arrays import unpack
-from service.base.choices import Method
+from service.base.choices import Method, Selection
 from service.base.errors import ConflictError, list_reasons
 from service.base.fields import Sun
 from service.base.progress import no_progress
@@ -259,9 +259,7 @@ class _Made:
     forecasts: list[Array]
 
 
-def _predict_all(
-    runtime: Runtime, folder: MeasurementFolder, bars: Progress
-) -> tuple[list[_Made], dict[str, str]]:
+def _predict_all(runtime: Runtime, folder: MeasurementFolder, bars: Progress) -> Selection[_Made]:
     """Predict in two threads; results in the order of the heliostats."""
     done = _counting(bars, "predict and forecast", len(folder.plant.heliostats))
 
@@ -280,7 +278,7 @@ def _predict_all(
         found = dict(
             zip(folder.plant.heliostats, pool.map(predict, folder.plant.heliostats), strict=True)
         )
-    return (
+    return Selection(
         [one for one in found.values() if not isinstance(one, str)],
         {name: one for name, one in found.items() if isinstance(one, str)},
     )
@@ -435,7 +433,7 @@ CAPTION = (
 )
 
 
-def _row(result: HeliostatResult) -> tuple[str, ...]:
+def _row(result: HeliostatResult) -> Sequence[str]:
     images = f"{result.used} + {result.judged}" if result.held_out else str(result.used)
     figures = (
         result.accuracy_ideal,

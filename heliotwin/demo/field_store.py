@@ -145,7 +145,7 @@ def _receive(
     """Receive the ``sent`` photographs of heliostats, in the order of their numbers."""
     for name in names:
         for one in folder.measurements(name):
-            if one.identifier in sent:
+            if one.external_id in sent:
                 progress(one.key)
                 (image,) = one.images.items()
                 receive(runtime, name, one.photograph(image[0]), image[1].read_bytes(), actor=ACTOR)

@@ -180,7 +180,7 @@ class Effect:
                     p.check(self.name, one)
 
     @classmethod
-    def parameters(cls) -> tuple[Parameter, ...]:
+    def parameters(cls) -> Sequence[Parameter]:
         """The effect's parameters in their order."""
         return tuple(Parameter(name=f.name, **f.metadata) for f in fields(cls) if f.metadata)
 

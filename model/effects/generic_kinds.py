@@ -203,7 +203,7 @@ class GenericKind:
     is_smooth: bool = True
 
     @property
-    def owners(self) -> tuple[Owner, ...]:
+    def owners(self) -> Sequence[Owner]:
         """What may have one coefficient: everything, or each heliostat or target."""
         if self.lives_in == "mirror":
             return ("all", "heliostat")

@@ -7,6 +7,7 @@ different strokes and tilts, and the best match gives its kind. The reference po
 on the full-size image: straight lines are fitted to the mark's edges with sub-pixel accuracy.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -101,7 +102,7 @@ class _Template:
 
 
 @cache
-def _templates() -> tuple[_Template, ...]:
+def _templates() -> Sequence[_Template]:
     """Ideal marks of all kinds, orientations, strokes and small tilts, in their bounding boxes."""
     kinds: tuple[Kind, ...] = ("L", "T")
     return tuple(_template(*choice) for choice in product(kinds, range(4), _STROKES, _TILTS_DEG))

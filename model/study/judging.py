@@ -1,5 +1,6 @@
 """Judge fits by images that no fit has seen."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -159,6 +160,23 @@ def few_gain(differences: Array, among: int = 1) -> Gain:
     error = float(variance / count) ** 0.5
     reach = float(t.ppf(1 - 0.025 / among, freedom)) * error
     return Gain(mean, mean - reach, mean + reach, mean / error)
+
+
+def clustered_gain(by_mirror: Sequence[Array]) -> Gain:
+    """`few_gain` of the differences (N,) of each mirror, where those of a mirror err together.
+
+    `paired_gain` takes the mirrors as given. Here they represent others: their mean errors count.
+
+    Source: the cluster-robust variance of a mean, Liang and Zeger 1986.
+    """
+    gain, n_images = few_gain(np.concatenate(by_mirror)), sum(map(len, by_mirror))
+    if len(by_mirror) < 2 or gain.score == 0:
+        return gain
+    together = np.array([(one - gain.mean).sum() for one in by_mirror]) / n_images
+    error = math.sqrt(len(by_mirror) / (len(by_mirror) - 1) * float(together @ together))
+    wider = max(1.0, error * gain.score / gain.mean)
+    reach = wider * (gain.high - gain.mean)
+    return Gain(gain.mean, gain.mean - reach, gain.mean + reach, gain.score / wider)
 
 
 WORSE = 0.002

@@ -146,7 +146,7 @@ class ParameterVector:
     unseen: frozenset[tuple[str, str]] = frozenset()
 
     @cached_property
-    def all(self) -> tuple[Unknown, ...]:
+    def all(self) -> Sequence[Unknown]:
         """All unknowns, in the order of the vector."""
         return tuple(
             u

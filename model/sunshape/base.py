@@ -43,7 +43,7 @@ class SunShape(ABC):
 
     @property
     @abstractmethod
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """Angles [rad] between which the profile is smooth, from 0 to where it ends."""
 
     @abstractmethod

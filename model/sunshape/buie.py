@@ -1,6 +1,6 @@
 """Buie's sun shape, the default: a disc with an aureole."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -33,7 +33,7 @@ class Buie(SunShape):
         check("circumsolar_ratio", self.circumsolar_ratio, 0.0, 0.5)
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """Centre, rim of the disc and end of the aureole [rad]."""
         return (0.0, SOLAR_DISC, AUREOLE_EDGE)
 
@@ -95,6 +95,6 @@ class _Disc(Buie):
     """The solar disc of Buie's sun shape without its aureole."""
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """Centre and rim of the disc [rad]."""
         return (0.0, SOLAR_DISC)

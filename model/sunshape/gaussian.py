@@ -1,6 +1,6 @@
 """Gaussian: a sun shape that, convolved with Gaussian errors, gives another."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -22,7 +22,7 @@ class Gaussian(SunShape):
         check("gaussian sigma [rad]", self.sigma, 1e-6, 0.1)
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """Cut at six standard deviations [rad]."""
         return (0.0, 6 * float(self.sigma))
 

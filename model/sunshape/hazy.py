@@ -3,6 +3,7 @@
 It is not declared in ``twin.json``: an effect creates it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,7 +29,7 @@ class Hazy(SunShape):
     circumsolar_ratio: float | Tensor = CLEAR_SKY
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """Those of the sun and of Buie's [rad]."""
         return tuple(sorted({*self.sun.edges, *Buie().edges}))
 

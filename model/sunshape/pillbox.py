@@ -1,6 +1,6 @@
 """Pillbox: the solar disc evenly bright, without limb darkening and aureole."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -21,7 +21,7 @@ class Pillbox(SunShape):
         check("pillbox half_angle [rad]", self.half_angle, 1e-6, 0.1)
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """The disc's centre and rim [rad]."""
         return (0.0, float(self.half_angle))
 

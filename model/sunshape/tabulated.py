@@ -1,5 +1,6 @@
 """A measured profile. It is not declared in ``twin.json``: its parameters are two tables."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ class Tabulated(SunShape):
             )
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def edges(self) -> Sequence[float]:
         """The table's angles [rad]."""
         return self.angles
 

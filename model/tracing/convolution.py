@@ -433,9 +433,9 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, rows: int, columns: int) -> Tens
     return image.view(x.shape[0], rows, columns)
 
 
-def quadratic(offset: Tensor) -> tuple[Tensor, ...]:
+def quadratic(offset: Tensor) -> list[Tensor]:
     """Shares of three pixels: before, at and after the one nearest to a point, at ``offset``."""
-    return 0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2
+    return [0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2]
 
 
 _CONE_SHARE = 0.99  # of the sun's light; windows are padded by its extent

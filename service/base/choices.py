@@ -3,7 +3,7 @@
 Every start of the command imports this module, so it must stay small.
 """
 
-from typing import Literal
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 from model.errors import InvalidInputError
 
@@ -12,6 +12,16 @@ Method = Literal["network", "refined"]
 
 MAX_IMAGES = {"network": 8, "refined": 64}
 """Maximum number of images per method."""
+
+Item = TypeVar("Item")
+
+
+class Selection(NamedTuple, Generic[Item]):
+    """What is used, and the reasons of what is left out, by name."""
+
+    chosen: list[Item]
+    skipped: dict[str, str]
+
 
 RoleName = Literal["read", "ingest", "operate", "admin"]
 """Roles of keys. Each role includes the permissions of those before it."""

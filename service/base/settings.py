@@ -3,7 +3,7 @@
 import ipaddress
 import math
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -72,7 +72,7 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" or (address is not None and address.is_loopback)
 
 
-def networks_of(text: str) -> tuple[Network, ...]:
+def networks_of(text: str) -> Sequence[Network]:
     """Parse addresses and networks that are separated by commas.
 
     Raises
@@ -237,7 +237,7 @@ class NetworkSettings(_SettingsGroup):
         return value
 
     @property
-    def trusted_proxies(self) -> tuple[Network, ...]:
+    def trusted_proxies(self) -> Sequence[Network]:
         """Networks of proxies whose headers about the sender are trusted."""
         return networks_of(self.forwarded_allow_ips) if self.proxy_headers else ()
 
@@ -257,7 +257,7 @@ class NetworkSettings(_SettingsGroup):
         return address_of(name) is not None
 
     @property
-    def own_names(self) -> tuple[str, ...]:
+    def own_names(self) -> Sequence[str]:
         """The names of `allowed_hosts`."""
         return tuple(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
 

@@ -47,7 +47,7 @@ class Tick:
     label: str
 
 
-def ticks(low: float, high: float, most: int = 5) -> tuple[Tick, ...]:
+def ticks(low: float, high: float, most: int = 5) -> Sequence[Tick]:
     """Ticks at round numbers between ``low`` and ``high``, about ``most`` of them."""
     values = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
     slack = 1e-9 * (high - low)
@@ -101,7 +101,7 @@ class ColourScale:
         ]
 
     @property
-    def ticks(self) -> tuple[Tick, ...]:
+    def ticks(self) -> Sequence[Tick]:
         """Ticks of a colour bar."""
         return ticks(self.low, self.high)
 
@@ -131,12 +131,12 @@ class PlanePicture:
         return np.array([-self.width, -self.height]) / 2
 
     @property
-    def x_ticks(self) -> tuple[Tick, ...]:
+    def x_ticks(self) -> Sequence[Tick]:
         """Ticks to the right [m]."""
         return ticks(float(self._low[0]), float(self._low[0]) + self.width)
 
     @property
-    def y_ticks(self) -> tuple[Tick, ...]:
+    def y_ticks(self) -> Sequence[Tick]:
         """Ticks upwards [m]."""
         return ticks(float(self._low[1]), float(self._low[1]) + self.height)
 
@@ -327,7 +327,7 @@ class History:
     title: str
     unit: str
     points: tuple[Point, ...]
-    ticks: tuple[Tick, ...]
+    ticks: Sequence[Tick]
     values: Sequence[tuple[str, float]]
 
     @property

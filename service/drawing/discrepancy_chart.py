@@ -32,8 +32,8 @@ class AmountChart:
     label: str
     lines: list[AmountLine]
     zero: float
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
+    x_ticks: Sequence[Tick]
+    y_ticks: Sequence[Tick]
 
 
 def amount_charts(coefficients: Iterable[Mapping[str, Any]]) -> list[AmountChart]:

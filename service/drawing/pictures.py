@@ -186,10 +186,10 @@ def surface_picture(
 Array = NDArray[np.floating]
 
 
-def of_peak(measured: Array, forecast: Array) -> tuple[Array, Array]:
-    """Two fluxes (n, n), scaled to the same sum, as shares of the measured peak."""
+def of_peak(measured: Array, forecast: Array) -> Array:
+    """Both fluxes (2, n, n), scaled to the same sum, as shares of the measured peak."""
     a, b = measured / measured.sum(), forecast / forecast.sum()
-    return a / a.max(), b / a.max()
+    return np.stack([a, b]) / float(a.max())
 
 
 def comparison_picture(

@@ -41,7 +41,7 @@ class Chart:
     """
 
     groups: dict[str, list[Image]]
-    ticks: tuple[Tick, ...]
+    ticks: Sequence[Tick]
     noise: float
 
     @property
@@ -153,8 +153,8 @@ class Scatter:
 
     label: str
     dots: list[ErrorPair]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
+    x_ticks: Sequence[Tick]
+    y_ticks: Sequence[Tick]
     correlation_before: float
     correlation_after: float
 

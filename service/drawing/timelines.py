@@ -185,7 +185,7 @@ class Timeline:
         return time_ticks(self.span, self.axis.zone)
 
     @property
-    def y_ticks(self) -> tuple[Tick, ...]:
+    def y_ticks(self) -> Sequence[Tick]:
         """Ticks of the values."""
         return ticks(self.bounds.low, self.bounds.high, 4)
 
@@ -198,7 +198,7 @@ class Timeline:
         return Tick(self.bounds.share(self.limit.number), f"{label} {self.unit}")
 
     @property
-    def marks(self) -> tuple[Tick, ...]:
+    def marks(self) -> Sequence[Tick]:
         """Vertical lines within the shown times."""
         drawn = [Tick(self.span.share(at.timestamp()), name) for at, name in self.axis.marks]
         return tuple(mark for mark in drawn if 0 <= mark.at <= 1)

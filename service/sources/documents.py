@@ -5,7 +5,6 @@ Source: the PAINT database of the Solar Tower Juelich, https://paint-database.or
 
 import json
 from dataclasses import dataclass, field, fields, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ from model.imaging import Camera, ImageKind
 from model.imaging.light import cameras_from_json
 from model.mount import Mount
 from model.plant import Cylinder, Facet, Heliostat, Plant, TargetPlane, require_cylinder_shape
-from model.pointing import Weather
 from model.sunshape import SHAPES, Buie, SunShape
 from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
@@ -64,66 +62,40 @@ SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "image/tiff": "tif", "image
 """File suffixes of images by media type; PAINT's are PNG."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """One calibration measurement.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measurement(IncomingPhotograph):
+    """One calibration measurement of a folder.
 
     Attributes
     ----------
-    identifier : str
-    heliostat, target : str
-    azimuth_deg, elevation_deg : float [deg]
-        Sun position; azimuth from north over east.
+    heliostat : str
+    external_id : str
+        Its name in the folder.
     spot : (3,) [m] or None
         Measured centroid in ENU: PAINT's UTIS, otherwise HeliOS.
-    spot_wgs84, helios_spot_wgs84 : tuple or None [deg, deg, m]
-        The same centroid in WGS84, and that by HeliOS.
-    motor_position : (2,) [steps] or None
     images : dict
         Files by kind.
-    taken_at : datetime or None
-        With time zone; from PAINT's STAC item ``ID-calibration-item-stac.json``, if there is one.
-    weather : Weather
-        From the properties, or from those of the STAC item.
     """
 
-    identifier: str
     heliostat: str
-    target: str
-    azimuth_deg: float
-    elevation_deg: float
+    external_id: str
+    kind: ImageKind | None = None
     spot: Array | None = None
-    spot_wgs84: tuple[float, float, float] | None = None
-    helios_spot_wgs84: tuple[float, float, float] | None = None
-    motor_position: Array | None = None
     images: dict[ImageKind, Path] = field(default_factory=dict)
-    taken_at: datetime | None = None
-    weather: Weather = field(default_factory=Weather)
 
     @property
-    def sun(self) -> Array:
+    def to_sun(self) -> Array:
         """Unit vector (3,) towards the sun."""
-        return sun_direction(self.azimuth_deg, self.elevation_deg)
+        return sun_direction(self.sun.azimuth_deg, self.sun.elevation_deg)
 
     @property
     def key(self) -> str:
-        """``heliostat/identifier``."""
-        return f"{self.heliostat}/{self.identifier}"
+        """``heliostat/external_id``."""
+        return f"{self.heliostat}/{self.external_id}"
 
     def photograph(self, kind: ImageKind | None) -> IncomingPhotograph:
         """Metadata of the image of one kind; for None, motors and spot without an image."""
-        motors = None if self.motor_position is None else self.motor_position.tolist()
-        return IncomingPhotograph(
-            target_name=self.target,
-            kind=kind,
-            sun=Sun(azimuth_deg=self.azimuth_deg, elevation_deg=self.elevation_deg),
-            external_id=self.identifier,
-            taken_at=self.taken_at,
-            motor_position=None if motors is None else (motors[0], motors[1]),
-            focal_spot_wgs84=self.spot_wgs84,
-            helios_spot_wgs84=self.helios_spot_wgs84,
-            weather=self.weather,
-        )
+        return replace(self, kind=kind)
 
 
 def get(data: Any, where: str, *keys: str | int) -> Any:
@@ -181,7 +153,7 @@ def _actuators(entries: Any, where: str) -> tuple[LinearActuator, LinearActuator
     if len(entries) != 2 or any(get(entry, where, "type_axis") != "linear" for entry in entries):
         return None
     axes = (parse(LinearAxis, entry, f"{where}, actuators") for entry in entries)
-    first, second = (LinearActuator(**axis.model_dump()) for axis in axes)
+    first, second = (axis.actuator() for axis in axes)
     return first, second
 
 
@@ -237,14 +209,13 @@ def read_heliostat(
     return heliostat
 
 
-def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
-    """Tower base (3,) in WGS84, and planar targets, of PAINT's ``tower-measurements.json``.
+def read_targets(tower: Any) -> dict[str, TargetPlane]:
+    """Planar targets of PAINT's ``tower-measurements.json``.
 
     `read_receivers` reads the receivers.
     """
     where = "tower measurements"
-    origin = _tower_base(tower, where)
-    plant = Plant("", origin)
+    plant = Plant("", read_tower_base(tower))
     targets = {}
     for name, entry in _typed(tower).items():
         if entry["type"] == "planar":
@@ -256,18 +227,19 @@ def read_targets(tower: Any) -> tuple[Array, dict[str, TargetPlane]]:
             ]
             targets[name] = TargetPlane.from_corners(name, *corners)
             if document.locator is not None:
-                located = document.locator.model_dump(exclude_none=True)
+                located = document.locator.locator_document
                 try:
                     targets[name] = targets[name].located_by(located)
                 except InvalidInputError as error:
                     raise InvalidInputError(f"{where}, {name}, locator: {error}") from None
     if not targets:
         raise InvalidInputError(f"{where}: no target of type 'planar'")
-    return origin, targets
+    return targets
 
 
-def _tower_base(tower: Any, where: str) -> Array:
+def read_tower_base(tower: Any) -> Array:
     """The tower base (3,) in WGS84."""
+    where = "tower measurements"
     properties = get(tower, where, "power_plant_properties")
     return np.array(parse(TowerBase, properties, f"{where}, power_plant_properties").coordinates)
 
@@ -280,7 +252,7 @@ def read_receivers(tower: Any) -> dict[str, AnyReceiver]:
     are in the object ``receivers``, which exports have; they take the place of PAINT's.
     """
     where = "tower measurements"
-    plant = Plant("", _tower_base(tower, where))
+    plant = Plant("", read_tower_base(tower))
     surveyed = {
         name: entry
         for name, entry in _typed(tower).items()
@@ -357,23 +329,26 @@ def read_measurement(identifier: str, heliostat: str, data: Any, plant: Plant) -
             f" {', '.join(plant.targets)}"
         )
     spots, motors = document.focal_spot or FocalSpots(), document.motor_position
-    steps = motors and [motors.axis_1_motor_position, motors.axis_2_motor_position]
     spot = spots.HeliOS if spots.UTIS is None else spots.UTIS
     return Measurement(
-        identifier=identifier,
+        document.target_name,
+        sun=Sun(
+            azimuth_deg=azimuth_from_north(document.sun_azimuth),
+            elevation_deg=document.sun_elevation,
+        ),
+        external_id=identifier,
         heliostat=heliostat,
-        target=document.target_name,
-        azimuth_deg=azimuth_from_north(document.sun_azimuth),
-        elevation_deg=document.sun_elevation,
         spot=None if spot is None else plant.to_enu(np.array(spot)),
-        spot_wgs84=spot,
+        focal_spot_wgs84=spot,
         helios_spot_wgs84=spots.HeliOS,
-        motor_position=None if steps is None else np.array(steps),
+        motor_position=None
+        if motors is None
+        else (motors.axis_1_motor_position, motors.axis_2_motor_position),
         weather=document.weather,
     )
 
 
-def read_item(item: Any, where: str) -> tuple[datetime | None, Weather]:
+def read_item(item: Any, where: str) -> ItemProperties:
     """Time and weather of a measurement from PAINT's STAC item.
 
     The time is in UTC if the item names no time zone. It is None if the item has only a period.
@@ -381,7 +356,7 @@ def read_item(item: Any, where: str) -> tuple[datetime | None, Weather]:
     properties = parse(ItemProperties, get(item, where, "properties"), where)
     if properties.taken_at is None and properties.start_datetime is None:
         raise InvalidInputError(f"{where}: datetime: must be an ISO 8601 time, got null")
-    return properties.taken_at, properties.weather
+    return properties
 
 
 def _sun_shape(declared: Any, where: str) -> SunShape:

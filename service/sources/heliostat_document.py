@@ -41,12 +41,6 @@ class _Part(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
 
 
-class LinearDriveDocument(_Part, Spindle):
-    """`model.actuator.LinearActuator`."""
-
-    kind: Literal["linear"] = Field("linear", description="A spindle.")
-
-
 class RotaryDriveDocument(_Part):
     """`model.actuator.RotaryActuator`."""
 
@@ -55,8 +49,12 @@ class RotaryDriveDocument(_Part):
     initial_angle: Angle = Field(description="Axis angle at zero steps [rad].")
     clockwise: Flag = Field(description="Whether the angle decreases as the position increases.")
 
+    def actuator(self) -> RotaryActuator:
+        """As the model has it."""
+        return RotaryActuator(**self.model_dump(exclude={"kind"}))
 
-DriveDocument = Annotated[LinearDriveDocument | RotaryDriveDocument, Field(discriminator="kind")]
+
+DriveDocument = Annotated[Spindle | RotaryDriveDocument, Field(discriminator="kind")]
 
 
 class MountDocument(_Part):
@@ -225,23 +223,17 @@ def _facet_part(facet: Facet) -> MirrorFacet:
     )
 
 
-def _drive_document(drive: Actuator) -> LinearDriveDocument | RotaryDriveDocument:
+def _drive_document(drive: Actuator) -> Spindle | RotaryDriveDocument:
     if isinstance(drive, LinearActuator):
-        return LinearDriveDocument(**vars(drive))
+        return Spindle(**vars(drive))
     return RotaryDriveDocument(**vars(drive))
-
-
-def _actuator(drive: LinearDriveDocument | RotaryDriveDocument) -> Actuator:
-    if isinstance(drive, LinearDriveDocument):
-        return drive.actuator()
-    return RotaryActuator(**drive.model_dump(exclude={"kind"}))
 
 
 def heliostat_from_json(name: str, properties: Any) -> Heliostat:
     """The heliostat of a document; `InvalidInputError` names a wrong field."""
     document = parse(HeliostatDocument, properties, f"properties of {name}")
     mount, optics = document.mount, document.optics
-    drives = mount.drives and (_actuator(mount.drives[0]), _actuator(mount.drives[1]))
+    drives = mount.drives and (mount.drives[0].actuator(), mount.drives[1].actuator())
     return Heliostat(
         name,
         np.array(document.position_m),

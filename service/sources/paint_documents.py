@@ -108,7 +108,7 @@ def _receiver_json(cylinder: Cylinder, plant: Plant) -> dict[str, object]:
 def measurement_json(photograph: IncomingPhotograph) -> dict[str, object]:
     """``calibration-properties.json`` of a photograph."""
     document: dict[str, object] = {
-        "target_name": photograph.target_name,
+        "target_name": photograph.target,
         "sun_azimuth": azimuth_from_south(photograph.sun.azimuth_deg),
         "sun_elevation": photograph.sun.elevation_deg,
     }

@@ -21,7 +21,7 @@ class IncomingPhotograph:
       corner.
     """
 
-    target_name: str
+    target: str
     kind: ImageKind | None
     sun: Sun
     external_id: str | None = None

@@ -1,7 +1,7 @@
 """Read ``plant.yaml``, the file that describes any solar tower plant."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -81,7 +81,7 @@ class PlantDescription:
     time_zone: str
     altitude: float
     marks_of: dict[str, str]
-    files: tuple[str, ...] = ()
+    files: Sequence[str] = ()
     assumed: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -297,7 +297,7 @@ def _warnings(text: PlantText, layout: list[PlacedHeliostat]) -> Iterable[str]:
             yield f"{text.place('heliostat_types', name)}: has no heliostat in the layout"
 
 
-def _files(entries: PlantDocument) -> tuple[str, ...]:
+def _files(entries: PlantDocument) -> Sequence[str]:
     """Files that the document names, each once."""
     facets = [entry.facets for entry in entries.heliostat_types.values()]
     named = [one.file for one in facets if isinstance(one, FacetFileEntry)]

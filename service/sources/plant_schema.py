@@ -23,7 +23,7 @@ from model.plant import require_cylinder_shape
 from service.base.fields import Extent, Flag, Metres, Model, Name, Number, Plane, Position, Whole
 from service.base.names import LINE, NAME
 from service.base.plant_facts import TowerSize
-from service.base.receivers import NAMES_WITH_UNITS
+from service.base.receivers import NAMES_WITH_UNITS, PlaneReceiverIn
 
 MAX_HELIOSTATS = 50_000
 """Most heliostats of a plant."""
@@ -122,9 +122,11 @@ class PlantHeader(PlantPart):
 
 
 class Spindle(BaseModel):
-    """`model.actuator.LinearActuator`, with its names."""
+    """`model.actuator.LinearActuator`."""
 
-    kind: Literal["linear"] = Field(description="A spindle.")
+    model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+    kind: Literal["linear"] = Field("linear", description="A spindle.")
     increment: Steps = Field(description="Steps for one metre of stroke [1/m].")
     initial_stroke_length: Annotated[Number, Field(ge=0, le=100)] = Field(
         description="At zero steps [m]."
@@ -154,6 +156,8 @@ class LinearDrive(PlantPart, Spindle):
     model_config = ConfigDict(
         alias_generator=lambda name: _SPINDLE_KEYS.get(name, name), serialize_by_alias=True
     )
+
+    kind: Literal["linear"] = Field(description="A spindle.")
 
 
 class RotaryDrive(PlantPart):
@@ -350,11 +354,8 @@ class PanelEntry(SurfacePart, Plane):
     """A rectangle; its normal is on the lit side."""
 
 
-class PlaneReceiver(PanelEntry):
+class PlaneReceiver(SurfacePart, PlaneReceiverIn):
     """A flat receiver."""
-
-    kind: Literal["plane"]
-    absorptance: Reflectance = 1.0
 
 
 class CylinderReceiver(SurfacePart):
@@ -474,7 +475,21 @@ class CameraEntry(PlantPart):
 Marks = Literal["none", "l_brackets"]
 
 
-class TargetEntry(PanelEntry):
+class LocatorDocument(PlantPart):
+    """How a target is located in photographs, in exports."""
+
+    marks: Marks
+    camera: CameraEntry | None = Field(
+        None, description="A camera that does not move; for targets without marks."
+    )
+
+    @property
+    def locator_document(self) -> dict[str, object]:
+        """What it declares of a target's place in photographs, as of `model.locating`."""
+        return self.model_dump(include={"marks", "camera"}, exclude_none=True)
+
+
+class TargetEntry(PanelEntry, LocatorDocument):
     """A calibration target."""
 
     kind: Literal["plane"]
@@ -483,21 +498,6 @@ class TargetEntry(PanelEntry):
         description="Marks at its corners that locate it in photographs. Without marks and camera"
         " its edges do, of a white rectangle against darker surroundings.",
     )
-    camera: CameraEntry | None = Field(
-        None, description="A camera that does not move; for targets without marks."
-    )
-
-    @property
-    def locator_document(self) -> dict[str, object]:
-        """What it declares of its place in photographs, as of `model.locating`."""
-        return self.model_dump(include={"marks", "camera"}, exclude_none=True)
-
-
-class LocatorDocument(PlantPart):
-    """How a target is located in photographs, in exports."""
-
-    marks: Marks
-    camera: CameraEntry | None = None
 
 
 class TowerEntry(PlantPart, TowerSize):

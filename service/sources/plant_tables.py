@@ -179,12 +179,12 @@ _FACETS = CsvColumns(
 )
 
 
-def read_facets(path: Path) -> tuple[FacetDesign, ...]:
+def read_facets(path: Path) -> Sequence[FacetDesign]:
     """Facets of a facets file; raises what `parse_facets` raises."""
     return parse_facets(file_name(path), read_text(path, MAX_CSV_BYTES))
 
 
-def parse_facets(name: str, text: str) -> tuple[FacetDesign, ...]:
+def parse_facets(name: str, text: str) -> Sequence[FacetDesign]:
     """Facets of the text of a facets file.
 
     Each has a centre [m] in mirror coordinates (x to the right seen from the front, y up the

@@ -1,7 +1,7 @@
 """Heliostat types of ``plant.yaml``."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def read_type(plant: PlantText, name: str) -> HeliostatType:
     """The heliostat type of this name."""
     path: KeyPath = ("heliostat_types", name)
 
-    def facets_of(file: str) -> tuple[FacetDesign, ...]:
+    def facets_of(file: str) -> Sequence[FacetDesign]:
         return read_facets(plant.file(file, *path, "facets", "file"))
 
     return _type(name, plant.entries.heliostat_types[name], partial(plant.place, *path), facets_of)
@@ -46,7 +46,7 @@ def type_of_entry(name: str, entry: HeliostatTypeEntry, files: Mapping[str, str]
         It names the field of `service.sources.heliostat_of_type.HeliostatOfType`.
     """
 
-    def facets_of(file: str) -> tuple[FacetDesign, ...]:
+    def facets_of(file: str) -> Sequence[FacetDesign]:
         if file not in files:
             known = f", which has {', '.join(files)}" if files else ""
             raise InvalidInputError(
@@ -62,7 +62,7 @@ def _type(
     name: str,
     entry: HeliostatTypeEntry,
     place: Callable[..., str],
-    facets_of: Callable[[str], tuple[FacetDesign, ...]],
+    facets_of: Callable[[str], Sequence[FacetDesign]],
 ) -> HeliostatType:
     """The type of an entry, whose keys have a ``place`` in messages."""
     facets = _facets(entry.facets, facets_of)
@@ -102,15 +102,15 @@ def types_to_json(path: Path) -> JsonObject:
 
 
 def _facets(
-    grid: FacetGridEntry | FacetFileEntry, facets_of: Callable[[str], tuple[FacetDesign, ...]]
-) -> tuple[FacetDesign, ...]:
+    grid: FacetGridEntry | FacetFileEntry, facets_of: Callable[[str], Sequence[FacetDesign]]
+) -> Sequence[FacetDesign]:
     if isinstance(grid, FacetFileEntry):
         return facets_of(grid.file)
     return facet_grid(grid.rows, grid.columns, grid.width_m, grid.height_m, grid.gap_m)
 
 
 def _canting(
-    chosen: str | CantingEntry | None, facets: tuple[FacetDesign, ...], place: str
+    chosen: str | CantingEntry | None, facets: Sequence[FacetDesign], place: str
 ) -> Canting:
     """The canting; that of the facets' file is individual."""
     has_normals = facets[0].normal is not None

@@ -7,7 +7,6 @@ from datetime import datetime
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import (
-    AfterValidator,
     AliasChoices,
     BaseModel,
     BeforeValidator,
@@ -27,7 +26,7 @@ from service.base.names import FORMS, LINES, is_text
 from service.base.plant_facts import TowerSize
 from service.base.receivers import ReceiverIn
 from service.base.validation_messages import format_validation_error
-from service.sources.plant_schema import LocatorDocument
+from service.sources.plant_schema import LocatorDocument, Spindle
 
 WindSpeed = Annotated[Number, Field(ge=0, le=100)]
 WindFrom = Annotated[Number, Field(ge=0, le=360)]
@@ -203,18 +202,12 @@ class TowerMeasurements(Document, ReceiversPart):
 # --------------------------------------------------------------------------------------------------
 
 
-class LinearAxis(DocumentPart):
-    """A linear actuator, see `model.actuator.LinearActuator`."""
+class LinearAxis(Spindle):
+    """A spindle with PAINT's names."""
 
     model_config = ConfigDict(extra="ignore")
 
-    increment: Number
-    initial_stroke_length: Number
-    offset: Number
-    pivot_radius: Number
-    initial_angle: Number
-    clockwise: Annotated[Number, AfterValidator(bool)] = Field(alias="clockwise_axis_movement")
-    max_increment: Number
+    clockwise: bool = Field(alias="clockwise_axis_movement")
 
 
 class KinematicsProperties(DocumentPart):

@@ -41,7 +41,7 @@ def other_warnings(row: MeasurementRow, photograph: IncomingPhotograph) -> Warni
 
     There are none if ``photograph`` has another sun or target, because they depend on these.
     """
-    if (row.target.name, row.sun) != (photograph.target_name, photograph.sun):
+    if (row.target.name, row.sun) != (photograph.target, photograph.sun):
         return []
     return [one for one in row.warnings or () if one["type"] != SUN_CONTRADICTS_TIME]
 

@@ -9,6 +9,7 @@ import numpy as np
 from model.plant import Plant, TargetPlane
 from model.plant_model import PlantModel
 from model.surface import control_points
+from service.base.fields import Sun
 from service.sources.documents import Measurement, read_heliostat, read_json
 from service.sources.folder import Importer, MeasurementFolder, read_declared
 
@@ -16,8 +17,9 @@ from service.sources.folder import Importer, MeasurementFolder, read_declared
 @dataclass(frozen=True, eq=False)
 class NotesFolder(MeasurementFolder):
     def read_measurements(self, heliostat: str) -> Iterator[Measurement]:
-        for number, sun in enumerate(read_json(self.root / "notes.json")["suns"]):
-            yield Measurement(str(number), heliostat, "wall", *sun)
+        for number, (azimuth, elevation) in enumerate(read_json(self.root / "notes.json")["suns"]):
+            sun = Sun(azimuth_deg=azimuth, elevation_deg=elevation)
+            yield Measurement("wall", sun=sun, external_id=str(number), heliostat=heliostat)
 
     def measured_surface(self, heliostat: str):
         return control_points(self.plant.heliostats[heliostat], np.zeros((4, 8, 8))), 3

@@ -34,7 +34,7 @@ def test_recorded_suns_are_where_the_sun_was_seen(stj_pointing: Path):
     measurements = dated(folder)
     apart, low = (
         apart_mrad(folder, measurements),
-        np.array([one.elevation_deg < 10 for one, _ in measurements]),
+        np.array([one.sun.elevation_deg < 10 for one, _ in measurements]),
     )
     assert len(apart) > 1000
     assert np.median(apart) < 0.05

@@ -29,7 +29,7 @@ def photographs(
     """
     generator = np.random.default_rng(4)
     plane, heliostat = (
-        read_targets(tower)[1]["lower"],
+        read_targets(tower)["lower"],
         read_heliostat("AA39", properties, np.array(ORIGIN)),
     )
     mount = apply_parameters(heliostat.mount, 0.3 * SPREAD * generator.normal(size=len(SPREAD)))

@@ -21,6 +21,7 @@ from service.sources.documents import (
     read_measurement,
     read_receivers,
     read_targets,
+    read_tower_base,
     unknown_parts,
 )
 from service.sources.folder import Importer, MeasurementFolder, read_declared
@@ -58,8 +59,9 @@ class PaintFolder(MeasurementFolder):
 
 def _with_item(measurement: Measurement, item: Any, where: str) -> Measurement:
     """Add the time of a STAC item, and its weather if the measurement has none."""
-    (taken_at, weather), own = read_item(item, where), measurement.weather
-    return replace(measurement, taken_at=taken_at, weather=weather if own == Weather() else own)
+    dated, own = read_item(item, where), measurement.weather
+    weather = dated.weather if own == Weather() else own
+    return replace(measurement, taken_at=dated.taken_at, weather=weather)
 
 
 def _towers(root: Path) -> list[Path]:
@@ -72,7 +74,7 @@ def _read(root: Path, heliostats: list[str] | None) -> PaintFolder:
         names = ", ".join(entry.name for entry in (file, *others))
         raise InvalidInputError(f"{root}: more than one tower file ({names}); leave the right one")
     tower = read_json(file)
-    origin, targets = read_targets(tower)
+    origin, targets = read_tower_base(tower), read_targets(tower)
     found: dict[str, Heliostat] = {}
     skipped = unknown_parts(tower)
     broken: dict[str, str] = {}

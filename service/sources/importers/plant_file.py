@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
-from service.base.fields import Elevation, Number
+from service.base.fields import Elevation, Number, Sun
 from service.base.plant_facts import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
@@ -86,16 +86,16 @@ class PlantFileFolder(MeasurementFolder):
             )
         spot = None if document.focal_spot_m is None else np.array(document.focal_spot_m)
         wgs84 = None if spot is None else tuple(self.plant.to_wgs84(spot).tolist())
-        motors = document.motor_position
         return Measurement(
-            identifier=identifier,
+            document.target_name,
+            sun=Sun(
+                azimuth_deg=document.sun_azimuth_deg % 360, elevation_deg=document.sun_elevation_deg
+            ),
+            external_id=identifier,
             heliostat=heliostat,
-            target=document.target_name,
-            azimuth_deg=document.sun_azimuth_deg % 360,
-            elevation_deg=document.sun_elevation_deg,
             spot=spot,
-            spot_wgs84=wgs84,
-            motor_position=None if motors is None else np.array(motors),
+            focal_spot_wgs84=wgs84,
+            motor_position=document.motor_position,
             images=_images(folder, identifier),
             taken_at=document.time,
             weather=document.weather,

@@ -1,7 +1,7 @@
 """Storage of images and measurements."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import datetime
 
 from sqlalchemy import ColumnElement, Select, Text, cast, select
@@ -314,23 +314,6 @@ def _keep_image(session: Session, image: ImageRow, accepted: bool) -> Added[Imag
     return Added(session.get_one(ImageRow, image.sha256, with_for_update=True), False)
 
 
-@dataclass(frozen=True)
-class PositionKey:
-    """Identity of a measurement without image: its id, or target, sun, motors [steps] and time.
-
-    ``identifier`` is the one that it gets if it is new: its id, or else a hash of what was sent.
-    """
-
-    identifier: str
-    external_id: str | None
-    target_id: int
-    sun_azimuth_deg: float
-    sun_elevation_deg: float
-    motor_axis_1: float | None
-    motor_axis_2: float | None
-    taken_at: datetime | None
-
-
 def _check_and_lock(session: Session, heliostat: HeliostatRow, row: MeasurementRow) -> None:
     """Check the id of a new measurement, and lock its heliostat and its target."""
     if row.external_id is not None:
@@ -355,9 +338,8 @@ def add_position(
     """
     _check_and_lock(session, heliostat, row)
     row.heliostat_id, row.kind = heliostat.id, NO_IMAGE
-    key = PositionKey(**{name.name: getattr(row, name.name) for name in fields(PositionKey)})
     for _ in range(ROUNDS):
-        existing = find_position(session, heliostat, key)
+        existing = find_position(session, heliostat, row)
         if existing is not None:
             return Added(existing, False)
         if insert(session, row):
@@ -366,26 +348,26 @@ def add_position(
     raise ConflictError("too many writers on the same measurement; try again")
 
 
-def find_position(
-    session: Session, heliostat: HeliostatRow, key: PositionKey
-) -> MeasurementRow | None:
-    """The measurement of the same motor positions and focal spot; None if they are new.
+_POSITION = ("target_id", "sun_azimuth_deg", "sun_elevation_deg", "motor_axis_1", "motor_axis_2")
 
-    The id decides, and may also belong to a photograph. If either has no id, it is a measurement
-    without an image with the same target, sun and motors, and the same or an unknown time. The
-    hash of what was sent finds it even if it was corrected since.
+
+def find_position(
+    session: Session, heliostat: HeliostatRow, new: MeasurementRow
+) -> MeasurementRow | None:
+    """The measurement of the same motor positions and focal spot as a ``new`` one; None without.
+
+    ``new`` has the identifier that it would get: its id, or else a hash of what was sent. The id
+    decides, and may also belong to a photograph. If either has no id, it is a measurement without
+    an image with the same target, sun and motors, and the same or an unknown time. The hash of
+    what was sent finds it even if it was corrected since.
     """
     row, query = MeasurementRow, _measurements(heliostat).order_by(MeasurementRow.id).limit(1)
-    same = [
-        getattr(row, name.name) == getattr(key, name.name)
-        for name in fields(key)
-        if name.name not in ("identifier", "external_id", "taken_at")
-    ]
-    if key.taken_at is not None:
-        same.append(row.taken_at.is_(None) | (row.taken_at == key.taken_at))
-    named = find_measurement(session, heliostat, key.identifier)
-    if key.external_id is not None:
-        named = named or session.scalar(query.where(row.external_id == key.external_id))
+    same = [getattr(row, name) == getattr(new, name) for name in _POSITION]
+    if new.taken_at is not None:
+        same.append(row.taken_at.is_(None) | (row.taken_at == new.taken_at))
+    named = find_measurement(session, heliostat, new.identifier)
+    if new.external_id is not None:
+        named = named or session.scalar(query.where(row.external_id == new.external_id))
         same.append(row.external_id.is_(None))
     return named or session.scalar(query.where(row.kind == NO_IMAGE, *same))
 

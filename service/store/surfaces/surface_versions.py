@@ -32,8 +32,8 @@ class Trust:
     ``sun_span_deg`` is the largest angle between the sun directions of its photographs.
     """
 
-    warnings: tuple[str, ...]
-    suspicious: tuple[str, ...]
+    warnings: Sequence[str]
+    suspicious: Sequence[str]
     mahalanobis_distance: float
     sun_span_deg: float
 
@@ -87,7 +87,7 @@ def valid_since(row: type[SurfaceRow] = SurfaceRow) -> ColumnElement[datetime]:
     return func.coalesce(row.valid_from, literal(EPOCH, UtcDateTime()))
 
 
-def newest_first() -> tuple[ColumnElement[Any], ...]:
+def newest_first() -> Sequence[ColumnElement[Any]]:
     """Sort order of precedence: the first version is the active one."""
     return valid_since().desc(), SurfaceRow.version.desc()
 

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import Any, NamedTuple, TypeVar
 
@@ -178,23 +178,8 @@ def _current_surfaces(
     if heliostat is not None:
         standing = standing.where(SurfaceRow.heliostat_id == heliostat)
     ranked = standing.subquery()
-    query = select(
-        SurfaceRow.heliostat_id,
-        SurfaceRow.is_candidate,
-        SurfaceRow.id,
-        SurfaceRow.version,
-        SurfaceRow.source,
-        SurfaceRow.valid_from,
-        SurfaceRow.misfit,
-        SurfaceRow.trusted,
-        SurfaceRow.warnings,
-        SurfaceRow.warned_since,
-        SurfaceRow.acknowledged_by,
-        SurfaceRow.acknowledged_at,
-        SurfaceRow.suspicious,
-        SurfaceRow.sun_span_deg,
-        SurfaceRow.created_at,
-    )
+    columns = (getattr(SurfaceRow, one.name) for one in fields(ActiveSurface))
+    query = select(SurfaceRow.heliostat_id, SurfaceRow.is_candidate, *columns)
     # The database selects them, because a plant has many versions and each refresh reads them.
     query = query.join(ranked, ranked.c.id == SurfaceRow.id).where(ranked.c.place == 1)
     active: dict[int, ActiveSurface] = {}
@@ -358,7 +343,7 @@ def compute_results(runtime: Runtime, line: HeliostatOverview) -> dict[str, obje
     return columns
 
 
-def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     assert line.surface is not None
     with runtime.database.reading() as session:
         query = select(SurfaceRow.arrays).where(SurfaceRow.id == line.surface.id)
@@ -366,7 +351,7 @@ def _compute_totals(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...
     return totals.deviation_mm, totals.uncertainty_mm
 
 
-def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     key = str(line.pending["accuracy"]).rpartition(" ")[0]  # without the newest photograph
     with runtime.database.reading() as session:
         state = session.get(HeliostatStateRow, line.id)
@@ -378,7 +363,7 @@ def _compute_accuracy(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, .
     return found.rank.accuracy, found.rank.photographs, key, found.accuracies, fall
 
 
-def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> tuple[Any, ...]:
+def _compute_pointing(runtime: Runtime, line: HeliostatOverview) -> Sequence[Any]:
     assert line.mounted is not None
     pointing = find_pointing(runtime, line.mounted)
     return (pointing and _POINTING.dump_python(pointing, mode="json"),)
@@ -389,7 +374,7 @@ class _StoredResult(NamedTuple):
 
     key: str
     columns: tuple[str, ...]
-    compute: Callable[[Runtime, HeliostatOverview], tuple[Any, ...]]
+    compute: Callable[[Runtime, HeliostatOverview], Sequence[Any]]
 
 
 _RESULTS = {

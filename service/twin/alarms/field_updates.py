@@ -32,7 +32,7 @@ from service.twin.alarms.field_overview import (
     read_summaries,
 )
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CHANGES, CameraChange, CameraWatch
+from service.twin.studies.camera_watch import CHANGES, CameraChange, camera_watch
 from service.twin.studies.field_change import EffectWatch
 
 logger = logging.getLogger("heliotwin.jobs")
@@ -69,7 +69,8 @@ class FieldStateWriter:
     """Writer of the state of heliostats whose data changed, and of the alarms."""
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime, self._watch, self._effects = runtime, CameraWatch(), EffectWatch(runtime)
+        self._runtime, self._effects = runtime, EffectWatch(runtime)
+        self._watch = camera_watch(runtime.database)
         self._marks, self._written_s = "", -_AGAIN_S
         self._has_limit, self.is_large = False, False
 

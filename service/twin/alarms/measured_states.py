@@ -2,13 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.stats import chi2
 
 from service import store
-from service.store.database import Database
 from service.twin.alarms.field_overview import HeliostatOverview, read_summaries, with_pointing
 from service.twin.alarms.light import find_lost_light
 from service.twin.forecasts.mirror_states import (
@@ -21,14 +19,12 @@ from service.twin.forecasts.mirror_states import (
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.pointing.errors import PointingState
 from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CameraWatch, LightReading
+from service.twin.studies.camera_watch import CameraWatch, LightReading, camera_watch
 
 # Lost share of the light above which a mirror counts as dimmed. Less is not distinct from haze.
 _MIN_LOSS = 0.05
 # Median of a Rayleigh distribution, in standard deviations per axis.
 _MEDIAN = math.sqrt(2 * math.log(2))
-
-_WATCHES: WeakKeyDictionary[Database, CameraWatch] = WeakKeyDictionary()
 
 
 def read_mirror_states(runtime: Runtime, names: Sequence[str]) -> MirrorStates:
@@ -38,7 +34,7 @@ def read_mirror_states(runtime: Runtime, names: Sequence[str]) -> MirrorStates:
         only = None
         if len(names) == 1:  # at each forecast of a heliostat: earlier days are cached
             only = store.get_heliostat(session, names[0]).id
-            watch = _WATCHES.setdefault(runtime.database, watch)
+            watch = camera_watch(runtime.database)
         lines = [line for line in read_summaries(session, only) if line.name in wanted]
         light = watch.read(session, settings).light
     lines = [with_pointing(runtime, line) for line in lines]

@@ -20,7 +20,7 @@ def submitted_metadata(photograph: IncomingPhotograph) -> dict[str, object]:
     """Metadata that was sent with an image, by paths of REST fields, as JSON values."""
     taken, motors = photograph.taken_at, photograph.motor_position
     return {
-        "target": photograph.target_name,
+        "target": photograph.target,
         "sun.azimuth_deg": photograph.sun.azimuth_deg,
         "sun.elevation_deg": photograph.sun.elevation_deg,
         "taken_at": None if taken is None else format_time(taken),
@@ -30,13 +30,19 @@ def submitted_metadata(photograph: IncomingPhotograph) -> dict[str, object]:
 
 def stored_metadata(row: MeasurementRow) -> dict[str, object]:
     """The same metadata of a stored measurement."""
-    motors = (row.motor_axis_1, row.motor_axis_2)
+    return submitted_metadata(photograph_from_row(row))
+
+
+def metadata_columns(photograph: IncomingPhotograph) -> dict[str, object]:
+    """Columns of a measurement's row that a correction may change, but for the target."""
+    motors = photograph.motor_position or (None, None)
     return {
-        "target": row.target.name,
-        "sun.azimuth_deg": row.sun_azimuth_deg,
-        "sun.elevation_deg": row.sun_elevation_deg,
-        "taken_at": None if row.taken_at is None else format_time(row.taken_at),
-        "motor_position": None if None in motors else list(motors),
+        "sun_azimuth_deg": photograph.sun.azimuth_deg,
+        "sun_elevation_deg": photograph.sun.elevation_deg,
+        "taken_at": photograph.taken_at,
+        "motor_axis_1": motors[0],
+        "motor_axis_2": motors[1],
+        **vars(photograph.weather),
     }
 
 
@@ -45,12 +51,12 @@ def photograph_from_row(row: MeasurementRow) -> IncomingPhotograph:
     return photograph_with_target(row, row.target.name)
 
 
-def photograph_with_target(known: Any, target_name: str) -> IncomingPhotograph:
+def photograph_with_target(known: Any, target: str) -> IncomingPhotograph:
     """The photograph of an object with a measurement's columns, such as a history record."""
     motors = (known.motor_axis_1, known.motor_axis_2)
     spot, helios = known.focal_spot_wgs84, known.helios_spot_wgs84
     return IncomingPhotograph(
-        target_name=target_name,
+        target=target,
         kind=None if known.kind == NO_IMAGE else cast(ImageKind, known.kind),
         sun=known.sun,
         external_id=known.external_id,

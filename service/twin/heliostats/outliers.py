@@ -8,7 +8,6 @@ benchmarks.light --consensus``).
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from model.network.architecture import MAX_IMAGES
 from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
+from service.base.choices import Selection
 from service.twin.heliostats.measurements import choose_diverse
 from service.twin.runtime.runtime import Operations
 
@@ -27,26 +27,19 @@ _DEVIATIONS = 3.0
 _LEAST = 0.05
 
 
-class Consistent(NamedTuple):
-    """Observations in order of time, unknown times first; reasons of outliers by identifier."""
-
-    observations: list[Observation]
-    outliers: dict[str, str]
-
-
 def reject_outliers(
     operations: Operations,
     heliostat: Heliostat,
     observations: Sequence[Observation],
     model: PlantModel,
-) -> Consistent:
-    """Remove outliers from observations.
+) -> Selection[Observation]:
+    """Remove outliers from observations; the others are in order of time, unknown times first.
 
     Of mirrors without a network none is removed: their refinement excludes images itself.
     """
     observations = sorted(observations, key=_time)
     if len(observations) < _FEWEST or not operations.has_network(heliostat):
-        return Consistent(observations, {})
+        return Selection(observations, {})
     glance = operations.predict(heliostat, choose_diverse(observations, MAX_IMAGES), model)
     images = operations.render(heliostat, observations, glance.z, model).clip(min=0)
     misfits = [
@@ -62,12 +55,12 @@ def reject_outliers(
         )
         for row in apart
     }
-    return Consistent([o for row, o in enumerate(observations) if row not in apart], reasons)
+    return Selection([o for row, o in enumerate(observations) if row not in apart], reasons)
 
 
-def _time(observation: Observation) -> tuple[bool, float]:
+def _time(observation: Observation) -> float:
     taken = observation.taken_at
-    return taken is not None, 0.0 if taken is None else taken.timestamp()
+    return -np.inf if taken is None else taken.timestamp()
 
 
 def list_outliers(misfits: Sequence[float], undated: int = 0) -> list[int]:

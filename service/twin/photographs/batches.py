@@ -18,7 +18,6 @@ from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.photographs.corrections import (
     Corrections,
     GivenCorrection,
-    PhotographChanges,
     Prepared,
     run_corrections,
 )
@@ -53,7 +52,7 @@ def _each(
     wrong: dict[int, str] = {}
     for place, entry in enumerate(given):
         try:
-            require_past(entry.changes.taken_at)
+            require_past(entry.taken_at)
             done.append(correct(entry))
         except (ModelError, ServiceError) as error:
             wrong[place] = str(error)
@@ -70,9 +69,9 @@ def preview_many(
 
     def preview(entry: GivenCorrection) -> CorrectionPreview | None:
         row = corrections.find(entry)
-        if entry.changes.of(row) == photograph_from_row(row):
+        if entry.of(row) == photograph_from_row(row):
             return None
-        columns = corrections.columns.of(row, entry.changes)
+        columns = corrections.columns.of(row, entry)
         quality = columns["quality"] if columns else {}
         assert isinstance(quality, dict)
         return CorrectionPreview(entry, row, quality.get("clock"))
@@ -199,9 +198,7 @@ def _restoring_all(session: Session, entry: AuditRow, reason: str) -> list[Given
     rows = session.execute(since.where(newer.measurement_id.in_(numbers)))
     changed = {(measurement, field) for measurement, after in rows for field in after}
     given = {
-        (heliostat, photograph): GivenCorrection(
-            heliostat, identifier, _restoring(correction, reason)
-        )
+        (heliostat, photograph): _restoring(heliostat, identifier, correction, reason)
         for correction, identifier, photograph, heliostat in found
         if not any(
             (correction.measurement_id, field) in changed
@@ -212,10 +209,14 @@ def _restoring_all(session: Session, entry: AuditRow, reason: str) -> list[Given
     return list(given.values())
 
 
-def _restoring(correction: CorrectionRow, reason: str) -> PhotographChanges:
+def _restoring(
+    heliostat: str, identifier: str, correction: CorrectionRow, reason: str
+) -> GivenCorrection:
     before = {name: correction.before[name] for name in _FIELDS if name in correction.before}
     taken_at, motors = before.get("taken_at"), before.get("motor_position")
-    return PhotographChanges(
+    return GivenCorrection(
+        heliostat,
+        identifier,
         reason,
         taken_at=None if taken_at is None else datetime.fromisoformat(taken_at),
         motor_position=None if motors is None else (motors[0], motors[1]),

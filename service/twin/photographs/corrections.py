@@ -3,7 +3,7 @@
 A change applies to all images of the photograph.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import NamedTuple, TypeVar
@@ -29,7 +29,7 @@ from service.store.photographs.image_files import digest
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
-from service.twin.heliostats.metadata import photograph_from_row, stored_metadata
+from service.twin.heliostats.metadata import metadata_columns, photograph_from_row, stored_metadata
 from service.twin.photographs.ingest import measure_photograph, measurement_row
 from service.twin.plant.model_versions import get_model
 from service.twin.runtime.runtime import Runtime
@@ -37,18 +37,10 @@ from service.twin.warnings import find_sun_contradictions, other_warnings, sun_c
 
 Done = TypeVar("Done")
 
-# Columns that a new measurement of the image changes: metadata, weather and measured values.
-_METADATA = (
-    "sun_azimuth_deg",
-    "sun_elevation_deg",
-    "taken_at",
-    "motor_axis_1",
-    "motor_axis_2",
-    "quality",
-    "warnings",
-)
 _WEATHER = tuple(weather.name for weather in fields(Weather))
-_MEASURED = ("accepted", "reason", "center_right_m", "center_up_m", "arrays")
+
+# Columns that a new measurement of the image changes, in addition to the metadata.
+_MEASURED = ("accepted", "reason", "quality", "warnings", "center_right_m", "center_up_m", "arrays")
 _PLANE = ("name", "geometry", "locator")
 
 
@@ -57,15 +49,17 @@ class NothingToChangeError(ConflictError):
 
 
 @dataclass(frozen=True)
-class PhotographChanges:
-    """Corrected metadata of a photograph; None leaves a value unchanged.
+class GivenCorrection:
+    """Corrected metadata of a heliostat's measurement; None leaves a value unchanged.
 
     ``excluded`` is whether the photograph is excluded from all computations. ``without``
     names metadata to remove: ``taken_at``, ``motor_position``.
     """
 
+    heliostat: str
+    identifier: str
     reason: str
-    target_name: str | None = None
+    target: str | None = None
     azimuth_deg: float | None = None
     elevation_deg: float | None = None
     taken_at: datetime | None = None
@@ -76,7 +70,7 @@ class PhotographChanges:
 
     def of(self, row: MeasurementRow) -> IncomingPhotograph:
         """The stored photograph with the changes applied."""
-        names = ("target_name", "taken_at", "motor_position")
+        names = ("target", "taken_at", "motor_position")
         stored = photograph_from_row(row)
         angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
         sun = {name: value for name, value in angles.items() if value is not None}
@@ -87,15 +81,6 @@ class PhotographChanges:
         return replace(stored, weather=replace(stored.weather, **weather), **changes)
 
 
-@dataclass(frozen=True)
-class GivenCorrection:
-    """The corrected metadata of a heliostat's measurement."""
-
-    heliostat: str
-    identifier: str
-    changes: PhotographChanges
-
-
 class Corrected(NamedTuple):
     """The named image of a corrected photograph, and the new entries of its images' histories."""
 
@@ -104,12 +89,7 @@ class Corrected(NamedTuple):
 
 
 def correct_photograph(
-    runtime: Runtime,
-    heliostat: str,
-    identifier: str,
-    changes: PhotographChanges,
-    actor: str,
-    version: int | None = None,
+    runtime: Runtime, given: GivenCorrection, actor: str, version: int | None = None
 ) -> Corrected:
     """Correct or exclude the photograph of an image.
 
@@ -127,7 +107,6 @@ def correct_photograph(
     GoneError
         If an image must be re-measured, but is deleted.
     """
-    given = GivenCorrection(heliostat, identifier, changes)
     return correct_photographs(runtime, [given], actor, version)[0]
 
 
@@ -162,7 +141,7 @@ def remeasure(runtime: Runtime, heliostat: str, identifier: str, reason: str, ac
 
     def write(corrections: Corrections) -> bool:
         corrections.lock([heliostat])
-        given = GivenCorrection(heliostat, identifier, PhotographChanges(reason))
+        given = GivenCorrection(heliostat, identifier, reason)
         return bool(corrections.remeasure(given).history)
 
     return run_corrections(runtime, actor, write)
@@ -221,7 +200,8 @@ class _Task:
         _, flux = measure_photograph(runtime, self.photograph, data, plane, self.cameras)
         (contradiction,) = find_sun_contradictions([self.photograph], self.origin)
         row = measurement_row(self.photograph, flux, 0, contradiction)
-        return {name: getattr(row, name) for name in (*_METADATA, *_WEATHER, *_MEASURED)}
+        measured = {name: getattr(row, name) for name in _MEASURED}
+        return metadata_columns(self.photograph) | measured
 
 
 class _Remeasured(NamedTuple):
@@ -238,7 +218,7 @@ class Prepared:
     """
 
     def __init__(self) -> None:
-        self.suns: dict[tuple[object, ...], SunContradiction | None] = {}
+        self.suns: dict[Hashable, SunContradiction | None] = {}
         self.measured: dict[int, _Remeasured] = {}
 
     def add(self, runtime: Runtime, lacking: "CorrectedColumns") -> None:
@@ -249,7 +229,7 @@ class Prepared:
         self.suns |= dict(zip(map(_sun_key, lacking.compared), found, strict=True))
 
 
-def _sun_key(photograph: IncomingPhotograph) -> tuple[object, ...]:
+def _sun_key(photograph: IncomingPhotograph) -> Hashable:
     """What the contradiction of a photograph's sun and time depends on."""
     sun, weather = photograph.sun, photograph.weather
     return sun.azimuth_deg, sun.elevation_deg, photograph.taken_at, weather.temperature_c
@@ -274,27 +254,21 @@ class CorrectedColumns:
         self.model = get_model(session)
         self._session, self._prepared, self._is_trial = session, prepared, is_trial
 
-    def of(self, row: MeasurementRow, changes: PhotographChanges) -> dict[str, object] | None:
+    def of(self, row: MeasurementRow, given: GivenCorrection) -> dict[str, object] | None:
         """The columns of a corrected image; None if it is not measured yet."""
-        photograph, target, cameras = changes.of(row), row.target, self.model.cameras
-        if changes.target_name is not None:
-            target = store.get_target(self._session, changes.target_name)
+        photograph, target, cameras = given.of(row), row.target, self.model.cameras
+        if given.target is not None:
+            target = store.get_target(self._session, given.target)
         before = camera_at(cameras, row.target.name, row.taken_at)
         is_alike = (
             target is row.target and camera_at(cameras, target.name, photograph.taken_at) == before
         )
         if not is_alike and row.image is not None:
             return self.remeasured(row, photograph, target)
-        motors = photograph.motor_position or (None, None)
         return {
             "target": target,
-            "sun_azimuth_deg": photograph.sun.azimuth_deg,
-            "sun_elevation_deg": photograph.sun.elevation_deg,
-            "taken_at": photograph.taken_at,
-            "motor_axis_1": motors[0],
-            "motor_axis_2": motors[1],
+            **metadata_columns(photograph),
             **sun_columns(row, photograph, self._contradiction(photograph)),
-            **vars(photograph.weather),
         }
 
     def remeasured(
@@ -387,13 +361,13 @@ class Corrections:
         """Correct all images of a photograph; raises what `correct_photograph` raises."""
         row = self.find(given)
         images = images_of_photograph(self.session, row).values()
-        made = [self._write(given, one, self.columns.of(one, given.changes)) for one in images]
+        made = [self._write(given, one, self.columns.of(one, given)) for one in images]
         return Corrected(row, [entry for entry in made if entry is not None])
 
     def remeasure(self, given: GivenCorrection) -> Corrected:
         """Re-measure an image and correct it."""
         row = self.find(given)
-        columns = self.columns.remeasured(row, given.changes.of(row), row.target)
+        columns = self.columns.remeasured(row, given.of(row), row.target)
         entry = self._write(given, row, columns)
         return Corrected(row, [] if entry is None else [entry])
 
@@ -412,9 +386,9 @@ class Corrections:
         """Write changed columns with their history; None if none changed, or one may not."""
         if columns is None or self._is_trial:
             return None
-        has_flux, reason = "arrays" in columns, given.changes.reason
+        has_flux, reason = "arrays" in columns, given.reason
         before = _state(row, has_flux)
-        _assign(row, columns, given.changes.excluded)
+        _assign(row, columns, given.excluded)
         after = _state(row, has_flux)
         apart = [name for name, value in after.items() if value != before[name]]
         if not apart:

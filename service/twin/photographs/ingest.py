@@ -37,7 +37,7 @@ from service.twin.heliostats.measurements import (
     accepted_measurement,
     load_heliostat_context,
 )
-from service.twin.heliostats.metadata import submitted_metadata
+from service.twin.heliostats.metadata import metadata_columns, submitted_metadata
 from service.twin.photographs.likeness import unlike_warnings
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces import accuracy
@@ -136,7 +136,7 @@ def store_position(
     with runtime.database.reading() as session:
         twin, target = (
             load_heliostat_context(session, heliostat),
-            store.get_target(session, photograph.target_name),
+            store.get_target(session, photograph.target),
         )
     (contradiction,) = find_sun_contradictions([photograph], twin.origin)
     row = position_row(photograph, target.id, contradiction)
@@ -213,7 +213,7 @@ def _read(runtime: Runtime, heliostat: str, photograph: IncomingPhotograph, data
     with runtime.database.reading() as session:
         _require_quota(session, runtime.settings, sha256, len(data))
         twin = load_heliostat_context(session, heliostat)
-        target = store.get_target(session, photograph.target_name)
+        target = store.get_target(session, photograph.target)
         return _Known(
             twin,
             target.id,
@@ -295,7 +295,6 @@ def measurement_row(
     }
     if measured.clipped is not None:
         images["clipped"] = measured.clipped
-    motors = photograph.motor_position or (None, None)
     spot, helios = photograph.focal_spot_wgs84, photograph.helios_spot_wgs84
     right, up = (
         (None, None) if measured.center_of_mass is None else measured.center_of_mass.tolist()
@@ -304,17 +303,12 @@ def measurement_row(
         external_id=photograph.external_id,
         kind=photograph.kind or NO_IMAGE,
         target_id=target_id,
-        sun_azimuth_deg=photograph.sun.azimuth_deg,
-        sun_elevation_deg=photograph.sun.elevation_deg,
-        motor_axis_1=motors[0],
-        motor_axis_2=motors[1],
-        taken_at=photograph.taken_at,
+        **metadata_columns(photograph),
         focal_spot_wgs84=None if spot is None else list(spot),
         helios_spot_wgs84=None if helios is None else list(helios),
         corners_px=(
             None if photograph.corners is None else {"corners": to_json_value(photograph.corners)}
         ),
-        **asdict(photograph.weather),
         forced=photograph.forced,
         accepted=bool(measured.quality.accepted),
         reason=measured.quality.reason or None,

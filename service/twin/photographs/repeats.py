@@ -256,9 +256,7 @@ def _changes_flux(
         return False
     if before.kind == "raw" and before.corners != after.corners:
         return True
-    cameras = [
-        camera_at(twin.model.cameras, one.target_name, one.taken_at) for one in (before, after)
-    ]
+    cameras = [camera_at(twin.model.cameras, one.target, one.taken_at) for one in (before, after)]
     return cameras[0] != cameras[1]
 
 

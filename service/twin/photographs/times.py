@@ -14,14 +14,14 @@ from service.base.fields import Moment, read_time
 from service.base.validation_messages import format_validation_error
 from service.store.photographs.groups import PhotographFilter, list_groups
 from service.twin.photographs.batches import MOST_ENTRIES
-from service.twin.photographs.corrections import GivenCorrection, PhotographChanges
+from service.twin.photographs.corrections import GivenCorrection
 
 _MOMENT = TypeAdapter(Moment)
 
 
 def given_time(heliostat: str, identifier: str, at: datetime, reason: str) -> GivenCorrection:
     """The time of a heliostat's measurement, submitted later."""
-    return GivenCorrection(heliostat, identifier, PhotographChanges(reason, taken_at=at))
+    return GivenCorrection(heliostat, identifier, reason, taken_at=at)
 
 
 def read_times(
@@ -37,11 +37,11 @@ def read_times(
         With ``where`` and the first line that is wrong.
     """
 
-    def changes(row: dict[str, str]) -> PhotographChanges:
+    def correction(row: dict[str, str]) -> GivenCorrection:
         at = _MOMENT.validate_python(_with_zone(row["taken_at"], zone))
-        return PhotographChanges(reason, taken_at=at)
+        return given_time(row["heliostat"], row["id"], at, reason)
 
-    return _read(lines, where, ("heliostat", "id", "taken_at"), changes)
+    return _read(lines, where, ("heliostat", "id", "taken_at"), correction)
 
 
 def read_motors(lines: Iterable[str], where: str, reason: str) -> list[GivenCorrection]:
@@ -50,20 +50,20 @@ def read_motors(lines: Iterable[str], where: str, reason: str) -> list[GivenCorr
     The heading may be missing; the errors are those of `read_times`.
     """
 
-    def changes(row: dict[str, str]) -> PhotographChanges:
+    def correction(row: dict[str, str]) -> GivenCorrection:
         steps = TypeAdapter(tuple[float, float]).validate_python((row["motor_1"], row["motor_2"]))
         if not all(abs(one) <= 1e9 for one in steps):
             raise InvalidInputError("motor positions must lie between -1e9 and 1e9 steps")
-        return PhotographChanges(reason, motor_position=steps)
+        return GivenCorrection(row["heliostat"], row["id"], reason, motor_position=steps)
 
-    return _read(lines, where, ("heliostat", "id", "motor_1", "motor_2"), changes)
+    return _read(lines, where, ("heliostat", "id", "motor_1", "motor_2"), correction)
 
 
 def _read(
     lines: Iterable[str],
     where: str,
     columns: tuple[str, ...],
-    changes: Callable[[dict[str, str]], PhotographChanges],
+    correction: Callable[[dict[str, str]], GivenCorrection],
 ) -> list[GivenCorrection]:
     text = [line for line in lines if line.strip()]
     names = [name.strip() for name in text[0].split(",")] if text else list(columns)
@@ -76,7 +76,8 @@ def _read(
     reader = csv.DictReader(text, columns if has_no_heading else None, skipinitialspace=True)
     for row in reader:
         try:
-            made = changes({name: value or "" for name, value in row.items() if name in columns})
+            given = {name: value or "" for name, value in row.items() if name in columns}
+            found.append(correction(given))
         except (ValidationError, InvalidInputError) as error:
             said = (
                 format_validation_error(error, columns[-1])
@@ -84,7 +85,6 @@ def _read(
                 else str(error)
             )
             raise InvalidInputError(f"{where}, line {reader.line_num}: {said}") from None
-        found.append(GivenCorrection(row["heliostat"] or "", row["id"] or "", made))
     if not found:
         raise InvalidInputError(f"{where}: holds no {'time' if 'taken_at' in columns else 'motor'}")
     return found

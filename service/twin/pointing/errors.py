@@ -23,7 +23,7 @@ from model.times import format_minute
 from service import store
 from service.base.errors import ServiceError
 from service.store.pointing import mounts
-from service.store.tables import MountRow
+from service.store.tables import HeliostatRow, MountRow
 from service.twin.heliostats.stored_mount import StoredMount, stored_mount
 from service.twin.pointing.calibration import load_readings
 from service.twin.runtime.runtime import Runtime
@@ -241,17 +241,20 @@ def find_pointing(runtime: Runtime, state: MountKey) -> PointingState | None:
     try:
         with runtime.database.reading() as session:
             mount = session.get_one(MountRow, state.mount, options=[undefer(MountRow.document)])
-            stored, newer = _newer(session, state.heliostat, mount)
+            row = store.get_heliostat(session, state.heliostat)
+            stored = stored_mount(session, row, mount)
+            newer = _newer(session, row, stored, mount)
         return pointing_state(stored, mount, newer, runtime.settings.alarm_pointing_mrad)
     except (ModelError, ServiceError) as error:
         logger.info("the pointing error of heliostat %s is not known: %s", state.heliostat, error)
     return None
 
 
-def _newer(session: Session, name: str, mount: MountRow) -> tuple[StoredMount, list[Reading]]:
-    """The heliostat's mount, and photographs taken after its newest calibration photograph."""
-    row = store.get_heliostat(session, name)
-    stored, at = stored_mount(session, row, mount), mount.document["history"]["at"]
+def _newer(
+    session: Session, row: HeliostatRow, stored: StoredMount, mount: MountRow
+) -> list[Reading]:
+    """Photographs taken after the newest one that the mount was calibrated by."""
+    at = mount.document["history"]["at"]
     newest = at[-1] if at else None
     since = (
         None if newest is None else datetime.fromisoformat(newest) + timedelta(seconds=1)
@@ -261,4 +264,4 @@ def _newer(session: Session, name: str, mount: MountRow) -> tuple[StoredMount, l
     ]
     targets = {one.name: store.target_plane(one) for one in store.list_targets(session)}
     readings, _ = load_readings(stored.heliostat, rows, stored.model, targets)
-    return stored, sorted(readings, key=lambda one: one.day)[-_MAX_READ:]
+    return sorted(readings, key=lambda one: one.day)[-_MAX_READ:]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from datetime import time as clock
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -24,6 +25,7 @@ from sqlalchemy.orm import Session
 
 from service.base.settings import Settings
 from service.store.columns import now
+from service.store.database import Database
 from service.store.tables import MeasurementRow, TargetRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 
@@ -167,3 +169,11 @@ class CameraWatch:
                 known = self._days.get(key) if day < today else None
                 days[day] = self._days[key] = known or _of_day(session, day, zone)
         return days
+
+
+_WATCHES: WeakKeyDictionary[Database, CameraWatch] = WeakKeyDictionary()
+
+
+def camera_watch(database: Database) -> CameraWatch:
+    """The process's only watch of a database, so that its days are read once."""
+    return _WATCHES.setdefault(database, CameraWatch())

@@ -15,7 +15,7 @@ from model.frames import sun_direction
 from model.observation import TRUSTED_MAHALANOBIS, Observation, SurfacePrediction
 from model.progress import Progress, silent
 from service import store
-from service.base.choices import Method, require_images
+from service.base.choices import Method, Selection, require_images
 from service.base.errors import ConflictError
 from service.store import audit
 from service.store.keys import RESERVED
@@ -194,17 +194,14 @@ def _is_older(new: store.NewSurface, today: SurfaceRow) -> bool:
 
 def choose_observations(
     operations: Operations, twin: HeliostatContext, rows: Sequence[MeasurementRow], images: int
-) -> tuple[list[Observation], dict[str, str]]:
-    """Choose up to ``images`` observations of different suns, the newest first.
-
-    Also return the reasons of outliers, by identifier.
-    """
+) -> Selection[Observation]:
+    """Choose up to ``images`` observations of different suns, the newest first, no outliers."""
     arrived = sorted(rows, key=lambda row: row.id)  # the order of those of unknown time
     observations = to_observations(
         [accepted_measurement(row, twin.origin) for row in arrived], twin.heliostat
     )
     kept, rejected = reject_outliers(operations, twin.heliostat, observations, twin.model)
-    return choose_diverse(kept[::-1], images), rejected
+    return Selection(choose_diverse(kept[::-1], images), rejected)
 
 
 def _new_surface(

@@ -13,7 +13,6 @@ place.
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,7 +44,6 @@ from service.sources.files import read_file
 from service.store import audit
 from service.store.photographs.measurements import (
     EXCLUDED,
-    PositionKey,
     find_measurement_of_image,
     find_position,
 )
@@ -65,6 +63,8 @@ from service.store.tables import (
     SurfaceRow,
     TargetRow,
 )
+from service.twin.heliostats.metadata import photograph_with_target
+from service.twin.photographs.ingest import position_row
 
 FOLDER = "history"
 
@@ -467,10 +467,9 @@ def _find(session: Session, row: HeliostatRow, given: Any) -> MeasurementRow | N
         target_id = session.scalar(select(TargetRow.id).where(TargetRow.name == given.target))
         if target_id is None:
             return None
-        values = {**dict(given), "target_id": target_id, "sun_azimuth_deg": given.sun.azimuth_deg}
-        values["sun_elevation_deg"] = given.sun.elevation_deg
-        key = PositionKey(**{one.name: values[one.name] for one in fields(PositionKey)})
-        return find_position(session, row, key)
+        sent = position_row(photograph_with_target(given, given.target), target_id, None)
+        sent.identifier = given.identifier
+        return find_position(session, row, sent)
     return find_measurement_of_image(session, row, given.image_sha256, given.kind)
 
 

@@ -154,8 +154,8 @@ def _import_heliostat(
         stored |= {one.identifier, one.external_id or ""} if file is None else {file}
         put(f"{name}/{one.identifier} {one.kind}", photograph_with_target(one, one.target), file)
     for measurement in folder.measurements(name, with_images=False):
-        if not measurement.images and measurement.identifier not in stored:
-            put(measurement.key, measurement.photograph(None), None)
+        if not measurement.images and measurement.external_id not in stored:
+            put(measurement.key, measurement, None)
         for kind in sorted(measurement.images, key=IMAGE_KINDS.index):
             file = measurement.images[kind]
             if file not in stored:

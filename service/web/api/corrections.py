@@ -24,7 +24,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
 from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
 from service.store.tables import MeasurementRow
-from service.twin.photographs.corrections import PhotographChanges, correct_photograph
+from service.twin.photographs.corrections import GivenCorrection, correct_photograph
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.runtime.runtime import Runtime
 from service.web.api.measurements import MeasurementOut, Motors, measurement_out
@@ -136,16 +136,18 @@ def patch_measurement(
     heliostat's surface again. Another weather outdates no surface, because only calibrations use
     it.
     """
-    changes = PhotographChanges(
+    given = GivenCorrection(
+        name,
+        measurement,
         reason=correction.reason,
-        target_name=correction.target,
+        target=correction.target,
         **({} if correction.sun is None else correction.sun.model_dump()),
         taken_at=correction.taken_at,
         motor_position=correction.motor_position,
         weather=correction.weather,
         excluded=correction.excluded,
     )
-    row, _ = correct_photograph(runtime, name, measurement, changes, identity.name, version)
+    row, _ = correct_photograph(runtime, given, identity.name, version)
     with runtime.database.reading() as session:
         set_tag(response, newest_correction(session, row))
         made, measured = made_from(session, row), measurement_out(session, name, row)

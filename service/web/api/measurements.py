@@ -2,13 +2,13 @@
 
 import json
 from codecs import BOM_UTF8
-from contextlib import suppress
+from collections.abc import Callable
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Depends, File, Form, Header, Query, Response, UploadFile, status
-from pydantic import BaseModel, BeforeValidator, Field, Json, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, Json, WrapValidator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile as StarletteUploadFile
@@ -223,15 +223,20 @@ class TakenQuery(Model):
         return Period(self.since, self.until)
 
 
-class MeasurementListQuery(TakenQuery):
+class MeasurementFilterQuery(Model):
+    """Filters of photographs and of their images."""
+
+    target: Name | None = Field(None, description="Only photographs of this target.")
+    dated: bool | None = Field(None, description="Only those of a known, or of an unknown time.")
+    warned: bool | None = Field(None, description="Only those with warnings, or without any.")
+
+
+class MeasurementListQuery(TakenQuery, MeasurementFilterQuery):
     """Which images of a heliostat are listed."""
 
     after: MeasurementName | None = Field(None, description="The last id of the page before.")
     accepted: bool | None = Field(None, description="Only accepted, or only refused ones.")
-    dated: bool | None = Field(None, description="Only those of a known, or of an unknown time.")
-    warned: bool | None = Field(None, description="Only those with warnings, or without any.")
     kind: Kind | None = Field(None, description="Only images of this kind.")
-    target: Name | None = Field(None, description="Only photographs of this target.")
     sort: Literal["created_at", "taken_at"] = Field(
         "created_at",
         description="By when they came, or were taken: then those of unknown time come last.",
@@ -362,7 +367,7 @@ def _photograph(metadata: MeasurementIn, runtime: Runtime) -> IncomingPhotograph
     helios = metadata.helios_spot_m
     used = helios if metadata.focal_spot_m is None else metadata.focal_spot_m
     return IncomingPhotograph(
-        target_name=metadata.target,
+        target=metadata.target,
         kind=None if metadata.kind == "none" else metadata.kind,
         sun=metadata.sun,
         external_id=metadata.id,
@@ -382,18 +387,18 @@ def get_row(name: str, measurement: str, runtime: Runtime) -> MeasurementRow:
         return store.get_measurement(session, store.get_heliostat(session, name), measurement)
 
 
-def _text(part: Any) -> Any:
-    """Text of a form part. Some clients send JSON as a file, and some begin it with a BOM."""
+def _read_metadata(part: Any, refuse: Callable[[Any], MeasurementIn]) -> MeasurementIn:
+    """The JSON of a form part. Some clients send it as a file, and some begin it with a BOM."""
     text = (
         part.file.read(_MAX_METADATA + 1).removeprefix(BOM_UTF8)
         if isinstance(part, UploadFile | StarletteUploadFile)
         else part
     )
-    with suppress(
-        json.JSONDecodeError, UnicodeDecodeError, RecursionError
-    ):  # what is no JSON is refused as such
-        json.loads(text, object_pairs_hook=unique_keys)
-    return text
+    try:
+        given = json.loads(text, object_pairs_hook=unique_keys)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        return refuse(text)  # as no JSON
+    return MeasurementIn.model_validate(given)
 
 
 def _file(part: Any) -> Any:
@@ -424,7 +429,9 @@ def _bytes(upload: UploadFile, limit: int) -> bytes:
 )
 def post_measurement(
     name: NamePath,
-    metadata: Annotated[Json[MeasurementIn], BeforeValidator(_text), Form(description="JSON")],
+    metadata: Annotated[
+        Json[MeasurementIn], WrapValidator(_read_metadata), Form(description="JSON")
+    ],
     runtime: RuntimeDep,
     identity: IdentityDep,
     response: Response,

@@ -19,6 +19,7 @@ from service.sources.documents import (
     read_facts,
     read_receivers,
     read_targets,
+    read_tower_base,
     unknown_parts,
 )
 from service.sources.plant_schema import CameraEntry, Marks
@@ -271,7 +272,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, by: AuthorshipDe
     """
     for name, reason in unknown_parts(document.raw).items():
         raise InvalidInputError(f"{name}.{reason}")
-    origin, targets = read_targets(document.raw)
+    origin, targets = read_tower_base(document.raw), read_targets(document.raw)
     receivers, facts = read_receivers(document.raw), read_facts(document.raw)
     parse_declared(document.declared or {}, "declared")  # refuse models that cannot be computed
     places = {name: document.raw[name]["coordinates"] for name in targets}

@@ -6,7 +6,7 @@ before the body is read. `Requires` on each route then checks the role. The serv
 if a route neither declares a role nor is listed in `PUBLIC`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
@@ -215,7 +215,7 @@ def _calls(dependant: Any) -> Iterator[Any]:
         yield from _calls(inner)
 
 
-def dependencies_of(route: Any) -> tuple[Any, ...]:
+def dependencies_of(route: Any) -> Sequence[Any]:
     """All callables that a route depends on, including its endpoint.
 
     Empty if ``route`` is not a FastAPI route.

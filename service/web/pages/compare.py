@@ -119,11 +119,6 @@ class Side:
         return f"{self.heliostat.name}, version {self.surface.version}"
 
     @property
-    def size(self) -> tuple[float, float]:
-        """Width and height of the mirror [m]."""
-        return self.heliostat.size_m
-
-    @property
     def shape(self) -> SurfaceErrors:
         """Deviation of the surface from the ideal mirror, by kind."""
         return surface_errors(self.z, self.places.sizes)
@@ -132,7 +127,7 @@ class Side:
         """The same of one of its versions, which may have other facets."""
         z = unpack(surface.arrays)["z"]
         is_same = len(z) == len(self.z)
-        places = self.places if is_same else FacetPlaces.in_rows(len(z), self.size)
+        places = self.places if is_same else FacetPlaces.in_rows(len(z), self.heliostat.size_m)
         return surface_errors(z, places.sizes)
 
     @property

@@ -10,11 +10,7 @@ from service import store
 from service.base.fields import MeasurementName, Model, ReadVersion, Reason, Text, Version
 from service.store.surfaces import decisions
 from service.twin.alarms.acknowledging import acknowledge_surface
-from service.twin.photographs.corrections import (
-    GivenCorrection,
-    PhotographChanges,
-    correct_photographs,
-)
+from service.twin.photographs.corrections import GivenCorrection, correct_photographs
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.evaluation import justify_by_hand
 from service.web.api.corrections import predict_again
@@ -101,8 +97,10 @@ def post_exclusion_form(
     identity: IdentityDep,
 ) -> Response:
     """Exclude photographs or use them again, and go to the job that predicts the surface again."""
-    changes = PhotographChanges(form.reason, excluded=form.excluded)
-    given = [GivenCorrection(name, photograph, changes) for photograph in form.photographs]
+    given = [
+        GivenCorrection(name, photograph, form.reason, excluded=form.excluded)
+        for photograph in form.photographs
+    ]
     correct_photographs(runtime, given, identity.name, form.version)
     if form.predict_again:
         return go_to(f"/jobs/{predict_again(runtime, name, identity.name)}")

@@ -32,8 +32,8 @@ from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.heliostats.metadata import stored_metadata
 from service.twin.photographs.corrections import (
+    GivenCorrection,
     NothingToChangeError,
-    PhotographChanges,
     correct_photograph,
 )
 from service.twin.photographs.deletion import delete_photograph
@@ -76,7 +76,9 @@ class CorrectionForm(Model):
     predict_again: bool = False
     version: ReadVersion = None
 
-    def changes(self, row: MeasurementRow, since: Sequence[CorrectionRow]) -> PhotographChanges:
+    def correction(
+        self, heliostat: str, row: MeasurementRow, since: Sequence[CorrectionRow]
+    ) -> GivenCorrection:
         """What its user changed of a stored photograph, which was corrected ``since`` it was shown.
 
         The page rounds angles and times.
@@ -97,14 +99,7 @@ class CorrectionForm(Model):
             for name, was in rounded.items()
             if (value := getattr(self, name)) not in (None, was)
         }
-        return PhotographChanges(
-            reason=self.reason,
-            target_name=given.get("target"),
-            azimuth_deg=given.get("azimuth_deg"),
-            elevation_deg=given.get("elevation_deg"),
-            taken_at=given.get("taken_at"),
-            excluded=given.get("excluded"),
-        )
+        return GivenCorrection(heliostat, row.identifier, self.reason, **given)
 
 
 def change_texts(correction: CorrectionRow) -> list[str]:
@@ -252,9 +247,9 @@ def post_correction_form(
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
         since = [] if form.version is None else list_corrections(session, row, form.version)
         session.refresh(row)
-        changes = form.changes(row, since)
+        given = form.correction(name, row, since)
     try:
-        correct_photograph(runtime, name, measurement, changes, identity.name, form.version)
+        correct_photograph(runtime, given, identity.name, form.version)
     except NothingToChangeError:
         return go_to(f"/heliostats/{name}/photographs/{measurement}?unchanged=true")
     if form.predict_again:

@@ -16,8 +16,8 @@ from service.store.photographs.groups import count_groups, get_group, list_group
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.corrections import (
+    GivenCorrection,
     NothingToChangeError,
-    PhotographChanges,
     correct_photograph,
 )
 from service.twin.photographs.display import compare_one
@@ -120,10 +120,10 @@ def post_review_form(
         raise InvalidInputError(
             f"action: {group.name} was refused by its measurement; correct it on its page instead"
         )
-    changes = PhotographChanges(form.reason, excluded=form.action == "exclude")
     name, identifier, actor = group.heliostat, group.best.identifier, identity.name
+    given = GivenCorrection(name, identifier, form.reason, excluded=form.action == "exclude")
     try:
-        corrected = correct_photograph(runtime, name, identifier, changes, actor, form.version)
+        corrected = correct_photograph(runtime, given, actor, form.version)
         undo = max(entry.id for entry in corrected.history)
     except NothingToChangeError:
         subject = f"heliostat {name} {identifier}"
@@ -146,7 +146,8 @@ def post_undo_form(
             raise NotFoundError(f"undo: there is no exclusion {form.undo}")
         row = session.get_one(MeasurementRow, correction.measurement_id)
         name = session.get_one(HeliostatRow, row.heliostat_id).name
-    changes = PhotographChanges("review undone", excluded=bool(correction.before["excluded"]))
+    was_excluded = bool(correction.before["excluded"])
+    given = GivenCorrection(name, row.identifier, "review undone", excluded=was_excluded)
     with suppress(NothingToChangeError):
-        correct_photograph(runtime, name, row.identifier, changes, identity.name, form.undo)
+        correct_photograph(runtime, given, identity.name, form.undo)
     return go_to(form.link(_PATH, at=row.id))

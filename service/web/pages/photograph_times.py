@@ -117,7 +117,7 @@ def _preview(
 
 
 def _values(given: GivenCorrection) -> tuple[object, ...]:
-    at, motors = given.changes.taken_at, given.changes.motor_position
+    at, motors = given.taken_at, given.motor_position
     return (() if at is None else (format_time(at),)) + (motors or ())
 
 

@@ -11,12 +11,17 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service import store
-from service.base.fields import FormDay, Model, Name, Version, drop_empty_fields, start_of_day
+from service.base.fields import FormDay, Name, Version, drop_empty_fields, start_of_day
 from service.store.listing import Period
 from service.store.photographs.groups import PhotographFilter, PhotographVerdict, list_groups
 from service.store.tables import TargetRow
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.api.measurements import MeasurementOut, TakenQuery, measurement_out
+from service.web.api.measurements import (
+    MeasurementFilterQuery,
+    MeasurementOut,
+    TakenQuery,
+    measurement_out,
+)
 from service.web.auth.dependencies import READ, RENDER_SLOT, RuntimeDep
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
@@ -41,14 +46,11 @@ class PhotographOut(MeasurementOut):
     mark: int = Field(exclude=True)
 
 
-class PhotographFilterQuery(Model):
+class PhotographFilterQuery(MeasurementFilterQuery):
     """Filters of photographs, but for their period."""
 
     heliostat: Name | None = Field(None, description="Only this heliostat.")
     verdict: PhotographVerdict | None = Field(None, description="Only of this verdict.")
-    target: Name | None = Field(None, description="Only photographs of this target.")
-    dated: bool | None = Field(None, description="Only those of a known, or of an unknown time.")
-    warned: bool | None = Field(None, description="Only those with warnings, or without any.")
     after: Version | None = Field(None, description="`next` of the page before.")
 
     def taken_in(self, session: Session, period: Period) -> PhotographFilter:

@@ -136,21 +136,19 @@ class Watchers:
             if time.monotonic() - self._looked_s >= _LOOK_EVERY_S:
                 watching = tuple(self._watching)
                 self._looked_s = time.monotonic()
-                self._news, self._let_in = await to_thread.run_sync(
-                    self._look, watching, limiter=self._thread
-                )
+                await to_thread.run_sync(self._look, watching, limiter=self._thread)
         return self._news.get(watcher.number) if watcher.presented in self._let_in else None
 
-    def _look(self, watching: Sequence[Watcher]) -> tuple[dict[int, _News], set[str | None]]:
+    def _look(self, watching: Sequence[Watcher]) -> None:
         """Query the jobs that are followed, and the presented keys that are still valid."""
         database, settings = self._runtime.database, self._runtime.settings
         with database.reading() as session:
             rows = queue.get_summaries(session, {watcher.number for watcher in watching})
         presented = {watcher.presented for watcher in watching}
-        let_in = {
+        self._let_in = {
             key for key in presented if security.identify(database, settings, key) is not None
         }
-        return {row.id: self._news_of(row) for row in rows}, let_in
+        self._news = {row.id: self._news_of(row) for row in rows}
 
     def _news_of(self, row: JobRow) -> _News:
         known = self._news.get(row.id)

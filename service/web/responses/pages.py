@@ -75,13 +75,14 @@ def asset(name: str) -> str:
 class _Rendering:
     """State of a page while it is rendered.
 
-    Its path, the plant's time zone, and its figures and tables by name.
+    Its path, the plant's time zone, its figures and tables by name, and at the end its text.
     """
 
     page: str
     zone: str = "UTC"
     figures: dict[str, Figure] = field(default_factory=dict)
     tables: dict[str, PageTable] = field(default_factory=dict)
+    text: str = ""
 
     def link(self, **part: str) -> str:
         """The URL of a part of the page."""
@@ -190,9 +191,9 @@ def count_badge(number: int) -> Markup:
     return Markup(badge).format(number) if number else Markup("")
 
 
-def _text(
+def _rendered(
     scope: Scope, template: str, context: dict[str, object], zone: str = "UTC"
-) -> tuple[str, _Rendering]:
+) -> _Rendering:
     identity: Identity | None = scope.get("state", {}).get("identity")
     may: dict[str, object] = {
         f"may_{role}": identity is not None and identity.role.includes(role)
@@ -206,10 +207,11 @@ def _text(
     rendering = _Rendering(quote(path) + (f"?{query}" if query else ""), zone)
     token = _RENDERING.set(rendering)
     try:
-        text = TEMPLATES.get_template(template).render(context, identity=identity, here=path, **may)
-        return text, rendering
+        found = TEMPLATES.get_template(template)
+        rendering.text = found.render(context, identity=identity, here=path, **may)
     finally:
         _RENDERING.reset(token)
+    return rendering
 
 
 def render(request: Request, template: str, /, **context: object) -> HTMLResponse:
@@ -224,9 +226,9 @@ def render(request: Request, template: str, /, **context: object) -> HTMLRespons
     runtime = request.app.state.runtime
     with runtime.database.reading() as session:
         zone = plant_time_zone(session, runtime.settings.time_zone)
-    text, rendering = _text(request.scope, template, context, zone)
+    rendering = _rendered(request.scope, template, context, zone)
     if part is None:
-        return HTMLResponse(text)
+        return HTMLResponse(rendering.text)
     name = "-".join(filter(None, [*request.scope["path"].split("/"), part.table or part.figure]))
     if part.table is not None:
         if part.table not in rendering.tables:
@@ -289,7 +291,7 @@ def error_page(scope: Scope, status: int, document: Mapping[str, object]) -> HTM
     """Render a problem document: a page, or for htmx only the message."""
     is_part = "hx-request" in Headers(scope=scope)
     template = "alert.html" if is_part else "error.html"
-    page = HTMLResponse(_text(scope, template, {"problem": document})[0], status)
+    page = HTMLResponse(_rendered(scope, template, {"problem": document}).text, status)
     page.headers.update(_NOTICE if is_part else {})
     return page
 

@@ -40,13 +40,13 @@ def test_folder_and_store_are_one_plant(pair_plant: Path, stored: Runtime, tmp_p
     names = list(folder.plant.heliostats)
 
     with open_folder(folder) as opened:
-        photographs, skipped = photographs_of(opened)
+        of_folder = photographs_of(opened)
     with stored.database.reading() as session:
         inputs = load_study_inputs(session, StudyIn(surfaces="measured"))
-    assert skipped == inputs.skipped == {}
+    assert of_folder.skipped == inputs.skipped == {}
     by_key = {one.key: one for one in inputs.photographs}
-    assert by_key.keys() == {one.key for one in photographs}
-    for one in photographs:
+    assert by_key.keys() == {one.key for one in of_folder.photographs}
+    for one in of_folder.photographs:
         same = by_key[one.key]
         assert np.array_equal(one.image, same.image)
         assert np.array_equal(one.setup.spot, same.setup.spot)

@@ -27,7 +27,7 @@ from service.twin.studies.study import row_of_report
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 from tests.service.wrong import RAW, wrong_somewhere
 
-PLANT = Plant("", np.array(ORIGIN), read_targets(tower_document())[1])
+PLANT = Plant("", np.array(ORIGIN), read_targets(tower_document()))
 MEASUREMENT = {
     "target_name": "lower",
     "sun_azimuth": 20.0,

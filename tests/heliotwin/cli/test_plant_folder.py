@@ -25,9 +25,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_is_read_as_its_file_describes_it(folder: Path):
     read = read_folder(folder)
     assert list(read.plant.heliostats) == ["A1", "B1"]  # C1 has no photographs
-    assert [one.identifier for one in read.measurements("A1")] == ["1", "2", "3", "4", "5"]
+    assert [one.external_id for one in read.measurements("A1")] == ["1", "2", "3", "4", "5"]
     first = read.measurements("A1")[0]
-    assert (first.azimuth_deg, first.elevation_deg, first.taken_at) == (140.0, 40.0, None)
+    assert (first.sun.azimuth_deg, first.sun.elevation_deg, first.taken_at) == (140.0, 40.0, None)
     assert read.skipped == {}
     assert list(read.plant.receivers) == ["main", "board"]
 
@@ -156,7 +156,7 @@ def test_a_wrong_measurement_is_skipped_by_name(
     path = tmp_path / "A1" / "Calibration" / "1-calibration-properties.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     read = read_folder(tmp_path)
-    assert [one.identifier for one in read.measurements("A1")] == ["2", "3", "4", "5"]
+    assert [one.external_id for one in read.measurements("A1")] == ["2", "3", "4", "5"]
     assert said in read.skipped["A1/1"]
 
 

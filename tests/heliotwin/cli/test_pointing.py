@@ -106,10 +106,11 @@ def test_photographs_that_a_mount_has_not_seen_say_where_motors_sent_the_light(t
         assert standing.mount.calibrated_until == date(2024, 5, 8)
         taken = []
         for one in source.measurements("AA39", with_images=False):
-            given = (one.sun, source.plant.targets[one.target], one.spot)
+            given = (one.to_sun, source.plant.targets[one.target], one.spot)
             setup = Setup(standing, control_points(standing), *given, taken_at=one.taken_at)
             image, day = FluxImage(setup, np.ones((8, 8))), day_of(one.taken_at)
-            taken.append(image.sent(stored.heliostat, stored.mount, one.motor_position, day))
+            motors = np.array(one.motor_position)
+            taken.append(image.sent(stored.heliostat, stored.mount, motors, day))
     assert [one.setup.angles is not None for one in taken] == [False] * 8 + [True] * 8
     setups, surveyed = [one.setup for one in taken[8:]], PlantModel(source.plant.site)
     before = align(setups, surveyed).displacements
@@ -332,7 +333,7 @@ def test_real_heliostats_are_forecast_to_a_milliradian(stj_pointing: Path, tmp_p
                 root
                 / name
                 / "Calibration"
-                / f"{measurement.identifier}-calibration-properties.json"
+                / f"{measurement.external_id}-calibration-properties.json"
             )
             document = json.loads(path.read_text())
             del document["focal_spot"]

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from benchmarks import data_folder
 from model.frames import wgs84_to_enu
 from service.base.settings import Settings
-from service.sources.documents import read_targets
+from service.sources.documents import read_targets, read_tower_base
 from service.sources.paint_documents import azimuth_from_north
 from service.web.app import create_app
 from tests.service.conftest import client_of
@@ -108,8 +108,8 @@ def test_measured_spot_lies_where_paint_saw_it(real: TestClient):
     answer = send(real, "151375").json()
     document = read(CALIBRATION / "151375-calibration-properties.json")
     tower = read(STJ / "WRI1030197-tower-measurements.json")
-    origin, targets = read_targets(tower)
-    expected = targets[document["target_name"]].to_plane(
+    origin = read_tower_base(tower)
+    expected = read_targets(tower)[document["target_name"]].to_plane(
         wgs84_to_enu(document["focal_spot"]["UTIS"], origin)
     )
     np.testing.assert_allclose(answer["center_of_mass_m"], expected, atol=0.2)

@@ -22,6 +22,7 @@ from service.sources.documents import (
     read_json,
     read_measurement,
     read_targets,
+    read_tower_base,
 )
 from service.sources.folder import measured_heights, read_declared, read_folder
 from tests.conftest import flat_heliostat
@@ -53,12 +54,12 @@ def test_motor_positions_agree_with_the_spot_to_about_a_degree(stj):
     """
     folder = read_folder(stj)
     heliostat = folder.plant.heliostats["AA39"]
-    measurement = next(m for m in folder.measurements("AA39") if m.identifier == "205363")
+    measurement = next(m for m in folder.measurements("AA39") if m.external_id == "205363")
     by_motor = heliostat.mount.attitude(
         heliostat.mount.angles_from_motors(measurement.motor_position)
     )
     by_spot = heliostat.mount.attitude(
-        heliostat.mount.align(heliostat.position, measurement.sun, measurement.spot)
+        heliostat.mount.align(heliostat.position, measurement.to_sun, measurement.spot)
     )
     assert np.degrees(np.arccos(by_motor[:, 2] @ by_spot[:, 2])) < 1.2
 
@@ -196,7 +197,7 @@ def test_bad_properties_name_the_field():
     "moment", ["2021-07-14T11:05:27Z", "2021-07-14T13:05:27+02:00", "2021-07-14T11:05:27"]
 )
 def test_a_stac_item_tells_when_a_measurement_was_taken(moment):
-    taken_at, _ = read_item({"properties": {"datetime": moment}}, "item")
+    taken_at = read_item({"properties": {"datetime": moment}}, "item").taken_at
     assert taken_at == datetime(2021, 7, 14, 11, 5, 27, tzinfo=UTC)
 
 
@@ -229,7 +230,7 @@ def test_two_files_of_properties_are_refused_by_name_and_the_plant_has_its_own(t
 
 def test_facets_in_another_order_are_refused():
     document = properties_document()
-    origin, _ = read_targets(tower_document())
+    origin = read_tower_base(tower_document())
     facets = document["facet_properties"]["facets"]
     assert len(read_heliostat("AA39", document, origin).facets) == 4
     for order in ([1, 0, 2, 3], [2, 3, 0, 1], [0, 2, 1, 3]):

@@ -35,7 +35,7 @@ def runtime(store_url: URL, tmp_path: Path, operations: FakeOperations) -> Itera
     )
     with opened.database.writing() as session:
         store.put_plant(session, "plant", ORIGIN)
-        for plane in read_targets(tower_document())[1].values():
+        for plane in read_targets(tower_document()).values():
             store.put_target(session, plane)
         store.put_heliostat(session, "AA39", properties_document(), (0.0, 30.0, 1.0))
         queue.add_job(session, "predictions", {"heliostats": ["AA39"]}, "tester\n\\N\t'")

@@ -79,12 +79,12 @@ def test_the_field_reads_one_version_of_each_heliostat(
         assert client.post("/v1/heliostats/AA39/surfaces", json={}).status_code == 201
     read = []
 
-    def counted(*values: Any) -> Any:
+    def counted(surface: Any, *values: Any) -> None:
         read.append(values)
-        return current(*values)
+        begin(surface, *values)
 
-    current = field_overview.ActiveSurface
-    monkeypatch.setattr(field_overview, "ActiveSurface", counted)
+    begin = field_overview.ActiveSurface.__init__
+    monkeypatch.setattr(field_overview.ActiveSurface, "__init__", counted)
     with client.app.state.runtime.database.reading() as session:  # type: ignore[attr-defined]
         (line,) = field_overview.read_summaries(session)
     assert line.surface is not None

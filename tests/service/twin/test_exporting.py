@@ -296,7 +296,7 @@ def test_excluded_photograph_is_used_by_nobody(
     exported: tuple[Path, dict[str, Any]], other: Runtime
 ):
     folder = read_folder(exported[0])
-    assert "bad" not in {measurement.identifier for measurement in folder.measurements("AA39")}
+    assert "bad" not in {measurement.external_id for measurement in folder.measurements("AA39")}
     import_folder(other, folder)
     with other.database.reading() as session:
         row = store.get_measurement(session, store.get_heliostat(session, "AA39"), "bad")

@@ -14,8 +14,8 @@ PAINT = {
     "KinematicsProperties",
     "PowerPlantProperties",
     "TowerMeasurements",
-    "LinearDriveDocument",
     "RotaryDriveDocument",
+    "Spindle",
 }
 """Schemas with the names of PAINT's documents, which stay."""
 
