@@ -430,7 +430,8 @@ def test_contradictions_are_named(world):
     )
     own[15] = replace(readings["H07"][15], name="15")
     own[20] = replace(own[20], spot=own[20].spot + np.array([1.8, 0.0, 0.3]))
-    named = calibrate(field, {**readings, "H06": own}).contradictions["H06"]
+    done = calibrate(field, {**readings, "H06": own})
+    named = done.contradictions["H06"]
     assert {name: one.reason for name, one in named.items()} == {
         "4": "wrong_target",
         "10": "clock",
@@ -439,6 +440,10 @@ def test_contradictions_are_named(world):
     }
     assert "1 h earlier" in named["10"].detail
     assert "H07" in named["15"].detail
+    listed = field_to_json(done, {})["heliostats"]["H06"]["outliers"]
+    assert {name: one["off_mrad"] for name, one in listed.items()} == {
+        name: round(one.error_mrad, 2) for name, one in named.items()
+    }
 
 
 def test_odd_property_files_start_from_the_field(world):

@@ -415,6 +415,13 @@ def test_an_effect_is_found_with_its_parameter_and_what_it_buys(hazy):
     stages = {"changes, days and single heliostats", "halves of the photographs"}
     assert set(reports) == {"sun_shape", "gravity_bending"} | stages
     assert (report["partly"], report["discrepancy"]) == ([], None)
+    (alone,) = found.found
+    for lookalikes, words in (
+        ([], ""),
+        (["slope_error"], "; these images cannot distinguish sun shape from slope error"),
+    ):
+        alike = replace(found, found=[replace(alone, lookalikes=lookalikes)])
+        assert f"{found.accuracy_after.mean():.1%}{words}." in conclude(alike)
 
 
 def test_several_effects_must_leave_less_of_pure_light_than_one(hazy):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
+from model.plant import Cylinder
 from model.receivers import Cavity, Panels
 from service.drawing.plant_picture import surface_lines
 from service.sources.plant_file import read_plant
@@ -204,6 +205,20 @@ def test_facets_of_any_type_are_written_for_soltrace(tmp_path: Path):
     np.testing.assert_allclose(
         normals @ normals.T, heliostat.facet_normals @ heliostat.facet_normals.T, atol=1e-9
     )
+
+
+def test_lines_of_a_cylinder_are_its_rims_and_five_between_them():
+    """A quarter of a cylinder, whose axis is 2 m south of the middle of its lit surface."""
+    south, up = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    drum = Cylinder("drum", np.array([0.0, 2.0, 50.0]), -south, up, 2.0, 6.0, 90.0)
+    low, high, *between = surface_lines(drum)
+    for rim, height in ((low, 47.0), (high, 53.0)):
+        np.testing.assert_allclose(np.hypot(rim[:, 0], rim[:, 1]), 2.0)
+        np.testing.assert_allclose(rim[:, 2], height)
+        np.testing.assert_allclose(np.abs(rim[[0, -1], 0]), np.sqrt(2))
+    assert len(between) == 5
+    for line in between:
+        np.testing.assert_allclose(line[1] - line[0], 6.0 * up, atol=1e-12)
 
 
 def test_a_cavity_is_read_as_nothing_else(tmp_path: Path):

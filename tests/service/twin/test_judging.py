@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from service.store.surfaces.decisions import Justification
+from service.store.surfaces.surface_versions import NewSurface, Trust
 from service.twin.surfaces.evaluation import (
     MIN_HELD_OUT,
+    Evaluation,
     JudgedBy,
     Precedence,
     begin_epoch_or_reject,
@@ -13,6 +16,7 @@ from service.twin.surfaces.evaluation import (
     promote_or_reject,
     promote_or_reject_first,
 )
+from service.twin.surfaces.prediction import _evaluated_first
 
 MEASURED, REFINED, NETWORK = (
     precedence_of(source, None) for source in ("measured", "refined", "network")
@@ -113,3 +117,21 @@ def test_a_first_surface_is_compared_with_the_ideal_mirror(
         else f"{used} of which" in reason
     )
     assert len(reason) <= 200
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (0.926, 0.874, "accuracy 93% on photographs, this surface 87%"),
+        (0.0, 0.0, "accuracy 0% on photographs, this surface 0%"),
+    ],
+)
+def test_the_warning_of_a_first_candidate_has_both_accuracies(
+    before: float, after: float, said: str
+):
+    nothing = np.zeros((1, 8, 8))
+    new = NewSurface("network", nothing, nothing, nothing, trust=Trust((), (), 1.0, 40.0))
+    rejected = Evaluation(None, False, Justification("a reason", before, after, 2))
+    found = _evaluated_first(None, new, rejected)
+    assert found.new.trust is not None
+    assert said in found.new.trust.warnings[-1]

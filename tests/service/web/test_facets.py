@@ -52,6 +52,14 @@ def test_each_facet_is_drawn_where_it_lies(tmp_path: Path):
     np.testing.assert_allclose(drawn, areas, rtol=0.03)
 
 
+def test_a_turned_facet_keeps_its_width_and_height():
+    """A facet of 2 m by 1 m, turned by 37 degrees."""
+    along = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0]])
+    i, j = np.meshgrid([-1.0, 1.0], [-0.5, 0.5], indexing="ij")
+    points = i[..., None] * along[0] + j[..., None] * along[1]
+    np.testing.assert_allclose(FacetPlaces.of_control_points(points[None]).sizes, [[2.0, 1.0]])
+
+
 def test_heights_rise_as_they_do_on_the_facet(tmp_path: Path):
     """i runs along x to the right, and j along y upwards."""
     places = FacetPlaces.of(read_plant(write_plant(tmp_path)).plant.heliostats["A1"])

@@ -222,6 +222,21 @@ def test_form_says_what_is_wrong(two_heliostats: TestClient, changes: dict[str, 
     assert said in answer.text
 
 
+def test_only_a_plan_with_a_limit_leads_to_aims(two_heliostats: TestClient):
+    answers = []
+    for limit in ({}, {"allowed_kw_m2": "0.0015"}):
+        asked = {"data": FORM | limit, "follow_redirects": False}
+        path = two_heliostats.post("/plans", **asked).headers["Location"]
+        answers.append(two_heliostats.post(f"{path}/aims", follow_redirects=False))
+    refused, enqueued = answers
+    assert (refused.status_code, "has no limit; plan it again" in refused.text) == (409, True)
+    assert enqueued.status_code == 303
+    job = two_heliostats.get(
+        f"/v1{enqueued.headers['Location']}", headers={"Accept": "application/json"}
+    ).json()
+    assert (job["kind"], job["payload"]["limit_w_m2"]) == ("aim-plans", 1.5)
+
+
 def test_form_names_heliostats_that_are_not_stored(two_heliostats: TestClient):
     answer = two_heliostats.post("/plans", data=FORM | {"heliostats": "AA39\nZZ99"})
     assert answer.status_code == 404

@@ -12,7 +12,8 @@ from model.ephemeris import sun_angles_at
 from service.drawing.charts import PlanePicture
 from service.drawing.timelines import Value, timeline
 from service.twin.alarms.field_filter import METRICS
-from service.web.pages.field_page import ColourEnds, colour_ends
+from service.twin.alarms.field_overview import HeliostatOverview
+from service.web.pages.field_page import ColourEnds, colour_ends, draw
 from service.web.pages.forecast import time_of
 
 LIMITS = ColourEnds(95.0, 75.0)
@@ -31,6 +32,17 @@ def test_colours_span_the_values_of_the_field(values: list[float], expected: tup
     lines: list[Any] = [SimpleNamespace(rank=SimpleNamespace(accuracy=v / 100)) for v in values]
     ends = colour_ends(lines, METRICS["accuracy"], LIMITS)
     assert (ends.best, ends.worst) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("count", [20, 40, 60])
+def test_squares_on_the_map_are_as_large_as_their_neighbours_allow(count: int):
+    lines = [
+        HeliostatOverview(f"{east}-{north}", 10.0 * east, 10.0 * north)
+        for east in range(count)
+        for north in range(count)
+    ]
+    drawing = draw(lines, lines, METRICS["accuracy"], LIMITS)
+    assert 0.5 < drawing.side / (10 * drawing.per_metre) < 0.9
 
 
 def test_axes_of_shares_end_at_100_percent():
