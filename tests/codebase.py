@@ -181,7 +181,12 @@ def lines_with(word: str) -> int:
 def _functions() -> Iterator[Definition]:
     for definition in definitions():
         is_endpoint = definition.path.startswith(
-            ("heliotwin/cli/verbs/", "service/web/api/", "service/web/pages/")
+            (
+                "heliotwin/cli/verbs/",
+                "service/web/api/",
+                "service/web/pages/",
+                "service/web/resources/",
+            )
         )
         if not isinstance(definition.node, ast.ClassDef) and not (
             is_endpoint and definition.node.decorator_list

@@ -23,7 +23,6 @@ from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Operations, Runtime
 from service.twin.runtime.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache
-from service.web.api import jobs
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter
 from service.web.auth.fair_limiter import FairLimiter
@@ -37,6 +36,7 @@ from service.web.middleware import (
     SecurityHeadersMiddleware,
     StoppingMiddleware,
 )
+from service.web.resources import jobs
 from service.web.responses import openapi, problems
 from service.web.responses.job_events import Watchers
 from service.web.root.health import SharedCheck

@@ -13,7 +13,7 @@ from service.jobs.kinds.plans import PlanIn
 from service.store.jobs import queue
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.web.auth.dependencies import OPERATE, IdentityDep, RuntimeDep
-from service.web.pages.aim_plan import Number
+from service.web.resources.jobs import Number
 from service.web.responses.pages import go_to_job
 
 router = APIRouter(include_in_schema=False)
