@@ -83,12 +83,14 @@ def collect_routes(kinds: Kinds) -> list[BaseRoute]:
     v1.include_router(
         jobs.creators(kinds)
     )  # before the routes of a job, which would read the names of kinds as numbers
-    resources = [one for one in modules_of("service.web.resources") if hasattr(one, "router")]
+    resources = modules_of("service.web.resources")
     for resource in (*modules_of("service.web.api"), *resources):
-        v1.include_router(resource.router)
+        if hasattr(resource, "router"):
+            v1.include_router(resource.router)
     root.include_router(v1)
     for resource in resources:
-        root.include_router(resource.pages)
+        if hasattr(resource, "pages"):
+            root.include_router(resource.pages)
     for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
         if hasattr(place, "router"):
             root.include_router(place.router)

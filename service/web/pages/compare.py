@@ -58,7 +58,6 @@ from service.web.auth.dependencies import (
     ComparisonCacheDep,
     RuntimeDep,
 )
-from service.web.pages.forecast import sun_now
 from service.web.pages.heliostat import newest_surfaces
 from service.web.pages.heliostat_charts import (
     OverTime,
@@ -69,6 +68,7 @@ from service.web.pages.heliostat_charts import (
     pointing_values,
     version_marks,
 )
+from service.web.resources.forecasts import sun_now
 from service.web.responses.pages import render
 
 router = APIRouter(include_in_schema=False, dependencies=[READ])

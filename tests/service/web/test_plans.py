@@ -20,7 +20,7 @@ from service.store.columns import now
 from service.store.job_tables import JobRow, JobStepRow
 from service.store.jobs import queue
 from service.store.record_retention import prune_jobs, prune_plans
-from service.web.pages import plan
+from service.web.resources import plans as plan
 from tests.page import Page
 from tests.service.conftest import FakeOperations
 from tests.service.web.pages import field_of, make_key, text_of, work

@@ -13,7 +13,7 @@ from service.drawing.charts import PlanePicture
 from service.drawing.timelines import Value, timeline
 from service.twin.alarms.field_filter import METRICS
 from service.web.pages.field_page import ColourEnds, colour_ends
-from service.web.pages.forecast import time_of
+from service.web.resources.forecasts import time_of
 
 LIMITS = ColourEnds(95.0, 75.0)
 
