@@ -51,7 +51,7 @@ from service.web.auth.dependencies import (
     NamePath,
     RuntimeDep,
 )
-from service.web.pages.heliostat import comparison_figures
+from service.web.resources.heliostat_figures import comparison_figures
 from service.web.responses.files import etag_matches
 from service.web.responses.pages import go_to, render
 

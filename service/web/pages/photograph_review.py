@@ -22,7 +22,7 @@ from service.twin.photographs.corrections import (
 )
 from service.twin.photographs.display import compare_one
 from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, READ, IdentityDep, RuntimeDep
-from service.web.pages.heliostat import comparison_figures
+from service.web.resources.heliostat_figures import comparison_figures
 from service.web.resources.photographs import PhotographsQuery
 from service.web.responses.pages import go_to, render
 

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Query, Response
 from service import store
 from service.store.tables import MeasurementRow
 from service.twin.alarms.field_filter import HeliostatFilter, filter_heliostats
-from service.twin.alarms.field_overview import PATIENCE_S, field_totals
+from service.twin.alarms.field_overview import PATIENCE_S
 from service.twin.surfaces.accuracy import photograph_name
 from service.web.api.field_overview import FieldLine, field_line
 from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, NamePath, RuntimeDep
@@ -95,52 +95,3 @@ def get_photographs_table(name: NamePath, runtime: RuntimeDep) -> Response:
     with runtime.database.reading() as session:
         rows = store.list_measurements(session, store.get_heliostat(session, name), None)
     return sheet_answer(f"{name}-photographs", _PHOTOGRAPH, map(_photograph, rows))
-
-
-_SURFACE = (
-    "version",
-    "source",
-    "is_active",
-    "is_candidate",
-    "valid_from",
-    "created_at",
-    "deviation_mm",
-    "uncertainty_mm",
-    "misfit",
-    "trusted",
-    "warnings",
-    "photographs",
-    "model",
-    "model_version",
-)
-
-
-@router.get("/heliostats/{name}/surfaces.csv")
-def get_surfaces_table(name: NamePath, runtime: RuntimeDep) -> Response:
-    """All versions of a heliostat's surface, oldest first."""
-    with runtime.database.reading() as session:
-        heliostat = store.get_heliostat(session, name)
-        today = store.find_surface_at(session, heliostat)
-        rows = store.list_surfaces(session, heliostat, None, arrays=True)
-    lines = []
-    for row in rows:
-        figures = field_totals(row.arrays)
-        lines.append(
-            [
-                row.version,
-                row.source,
-                today is not None and row.id == today.id,
-                row.is_candidate,
-                row.valid_from,
-                row.created_at,
-                figures.deviation_mm,
-                figures.uncertainty_mm,
-                row.misfit,
-                row.trusted,
-                "; ".join(row.warnings or []),
-                " ".join(one.identifier for one in row.measurements),
-                row.model,
-                row.model_version and int(row.model_version.partition(":")[0]),
-            ]
-        )
-    return sheet_answer(f"{name}-surfaces", _SURFACE, lines)

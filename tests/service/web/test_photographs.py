@@ -35,7 +35,7 @@ from service.store.photographs.groups import (
 from service.store.tables import TargetRow
 from service.twin.runtime import runtime
 from service.web.app import create_app
-from service.web.pages import heliostat
+from service.web.resources import heliostats as heliostat
 from service.web.resources import photographs as photograph_list
 from tests.page import Page
 from tests.service.conftest import (
