@@ -84,7 +84,7 @@ def collect_routes(kinds: Kinds) -> list[BaseRoute]:
         jobs.creators(kinds)
     )  # before the routes of a job, which would read the names of kinds as numbers
     resources = modules_of("service.web.resources")
-    for resource in (*modules_of("service.web.api"), *resources):
+    for resource in resources:
         if hasattr(resource, "router"):
             v1.include_router(resource.router)
     root.include_router(v1)

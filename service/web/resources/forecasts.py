@@ -73,7 +73,7 @@ from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to, leave_for, render
-from service.web.responses.paging import OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import AfterId, OrderQuery, Page, Since, Until, page
 from service.web.responses.representation import Maps
 
 
@@ -214,7 +214,7 @@ def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) 
 def list_forecasts(
     runtime: RuntimeDep,
     limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    after: AfterId = None,
     heliostat: Annotated[Name | None, Query(description="Only those of this heliostat.")] = None,
     target: Annotated[Name | None, Query(description="Only those on this target.")] = None,
     since: Since = None,
@@ -399,7 +399,7 @@ def offered_heliostats(runtime: Runtime, prefix: str, after: str | None) -> Sequ
         return store.list_heliostats(session, _OFFERED, after, prefix)
 
 
-def _filled(
+def _form_context(
     runtime: RuntimeDep,
     heliostat: Annotated[Lines, Query(max_length=2000)] = "",
     job: Annotated[Version | None, Query()] = None,
@@ -486,10 +486,10 @@ def get_offered_heliostats(
 
 @pages.get("/forecast", dependencies=[READ])
 def get_forecast_form(
-    request: Request, filled: Annotated[dict[str, object], Depends(_filled)]
+    request: Request, context: Annotated[dict[str, object], Depends(_form_context)]
 ) -> HTMLResponse:
     """The form with defaults, or with the values of a forecast job."""
-    return render(request, "forecast.html", **filled, forecast=None)
+    return render(request, "forecast.html", **context, forecast=None)
 
 
 @pages.post("/forecast", dependencies=[OPERATE, COMPUTE_SLOT])

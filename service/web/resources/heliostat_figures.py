@@ -11,16 +11,20 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from model.errors import ModelError
 from model.plant import inside_outline
 from service.base.arrays import unpack
+from service.base.errors import ServiceError
 from service.base.settings import Settings
 from service.drawing import charts
-from service.drawing.charts import ColourScale, HeatMap, History
+from service.drawing.charts import ColourScale, HeatMap, History, PlanePicture
 from service.drawing.facets import FacetPlaces
 from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
-from service.store.tables import MountRow, SurfaceRow
+from service.store.tables import MeasurementRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import FieldTotals, field_totals
+from service.twin.photographs.display import compare_one
+from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import PhotographComparison
 from service.twin.surfaces.accuracy import photograph_name as photograph_of
 
@@ -172,6 +176,24 @@ def comparison_figures(
         ]
         figures.append(ComparisonFigure(comparison, *maps))
     return ComparisonFigures(figures, flux, difference, largest if largest > bound else None)
+
+
+def forecast_figures(
+    runtime: Runtime, heliostat: str, measured: MeasurementRow | None
+) -> dict[str, object]:
+    """The forecast of a measured photograph next to its flux, or why there is none."""
+    compared, trouble = [], None
+    if measured is not None:
+        try:
+            compared = [compare_one(runtime, heliostat, measured.identifier)]
+        except (ModelError, ServiceError) as error:
+            trouble = str(error)
+    bound = runtime.settings.figure_scales["flux_difference"]
+    return {
+        "comparisons": comparison_figures(compared, bound),
+        "trouble": trouble,
+        "plane_picture": PlanePicture,
+    }
 
 
 # --- over time

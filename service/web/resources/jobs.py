@@ -71,7 +71,7 @@ from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
 from service.web.responses.openapi import TEXT, arrays, problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import AfterId, OrderQuery, Page, Since, Until, page
 from service.web.responses.representation import Maps
 
 
@@ -224,7 +224,7 @@ _PAGE = 50
 def list_jobs(
     runtime: RuntimeDep,
     limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    after: AfterId = None,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     kind: KindName = None,
     since: Since = None,
@@ -459,6 +459,10 @@ def _view(
         )
 
 
+_LISTS = ("counts", "surfaces", "unchanged", "judged", "warnings")
+"""Parts of results that the page shows as they are."""
+
+
 @pages.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
 def get_job_page(
     view: Annotated[JobView, Depends(_view)],
@@ -500,12 +504,8 @@ def get_job_page(
         in_zone=in_zone(result.get("time_zone") or runtime.settings.time_zone),
         target=(view.payload or {}).get("target"),
         facts={name: value for name, value in result.items() if is_plain(value)},
-        counts=result.get("counts", {}),
-        surfaces=result.get("surfaces", {}),
-        unchanged=result.get("unchanged", {}),
-        judged=result.get("judged", {}),
+        **{name: result.get(name, {}) for name in _LISTS},
         skipped=skipped,
-        warnings=result.get("warnings", []),
         shown=MOST,
         begin=begin,
         page=page,

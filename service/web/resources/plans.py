@@ -5,7 +5,7 @@ A plan compares the twin with ideal mirrors, and with the flux that the receiver
 
 from dataclasses import dataclass
 from datetime import datetime, time, timedelta
-from typing import Annotated, Any
+from typing import Annotated
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -347,15 +347,23 @@ def _day(session: Session, row: JobRow, at: int | None, zone: str) -> Day:
 
 
 def _context(
-    runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None
-) -> dict[str, Any]:
+    runtime: Runtime,
+    session: Session,
+    zone: str,
+    after: int | None,
+    asked: PlanIn | None,
+    when: When | None = None,
+) -> dict[str, object]:
     """The form, filled with a request or with defaults, and the list of plans."""
-    zone = plant_time_zone(session, runtime.settings.time_zone)
     receivers = [row.name for row in store.list_receivers(session)]
     targets = [*receivers, *(row.name for row in store.list_targets(session))]
+    filled = _likely(targets, zone) if asked is None else _filled(asked)
+    if when is not None:
+        at = time_of(when, zone, store.find_plant(session))
+        filled = filled.model_copy(update={"first_at": at, "last_at": at})
     plans = store.list_plans(session, LISTED + 1, after)
     return {
-        "filled": _likely(targets, zone) if asked is None else _filled(asked),
+        "filled": filled,
         "in_zone": in_zone(zone),
         "zone": zone,
         "whens": WHENS,
@@ -373,26 +381,21 @@ After = Annotated[Version | None, Query(description="The last plan of the page b
 Number = Annotated[Version, Path(description="Id of the plan's job.")]
 
 
-def _listed(
+def _list_context(
     runtime: RuntimeDep,
+    zone: ZoneDep,
     after: After = None,
     aims: Annotated[Version | None, Query(description="Job of an aim plan to fill in.")] = None,
     when: Annotated[When | None, Query(description="A time to fill in.")] = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     with runtime.database.reading() as session:
-        context = _context(
-            runtime, session, after, None if aims is None else plan_with(session, aims)
-        )
-        if when is not None:
-            at = time_of(when, context["zone"], store.find_plant(session))
-            filled = context["filled"].model_copy(update={"first_at": at, "last_at": at})
-            context["filled"] = filled
-    return context
+        asked = None if aims is None else plan_with(session, aims)
+        return _context(runtime, session, zone, after, asked, when)
 
 
 @pages.get("/plans", dependencies=[READ])
 def get_plans_page(
-    request: Request, listed: Annotated[dict[str, Any], Depends(_listed)]
+    request: Request, listed: Annotated[dict[str, object], Depends(_list_context)]
 ) -> HTMLResponse:
     """The form, and the list of plans."""
     return render(request, "plan.html", **listed)
@@ -400,14 +403,15 @@ def get_plans_page(
 
 def plan_figures(
     runtime: Runtime, number: int, after: int | None, at: int | None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """What the page of a plan draws, with its request in the form."""
     with runtime.database.reading() as session:
         row = queue.get_job(session, number, arrays=True)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
         asked = _requested(row)
-        context = _context(runtime, session, after, asked)
-        day = None if row.result is None else _day(session, row, at, context["zone"])
-    aims = None if day is None else aims_for(asked, context["zone"])
+        context = _context(runtime, session, zone, after, asked)
+        day = None if row.result is None else _day(session, row, at, zone)
+    aims = None if day is None else aims_for(asked, zone)
     return context | {
         "job": row,
         "day": day,

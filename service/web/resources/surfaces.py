@@ -64,7 +64,7 @@ from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to
-from service.web.responses.paging import OrderQuery, Page, page
+from service.web.responses.paging import AfterId, OrderQuery, Page, page
 from service.web.responses.representation import Maps
 
 
@@ -431,10 +431,7 @@ def _undo(runtime: Runtime, name: str, actor: str, **expected: int | None) -> De
 
 @router.get("/decisions", responses=problems(404), dependencies=[READ])
 def list_decisions(
-    name: NamePath,
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    name: NamePath, runtime: RuntimeDep, limit: Limit = 100, after: AfterId = None
 ) -> Page[DecisionOut]:
     """List the decisions about the active surface, newest first."""
     with runtime.database.reading() as session:
@@ -581,22 +578,15 @@ def surface_rows(runtime: Runtime, name: str) -> Iterator[list[object]]:
         rows = store.list_surfaces(session, heliostat, None, arrays=True)
     for row in rows:
         figures = field_totals(row.arrays)
-        yield [
-            row.version,
-            row.source,
-            today is not None and row.id == today.id,
-            row.is_candidate,
-            row.valid_from,
-            row.created_at,
-            figures.deviation_mm,
-            figures.uncertainty_mm,
-            row.misfit,
-            row.trusted,
-            "; ".join(row.warnings or []),
-            " ".join(one.identifier for one in row.measurements),
-            row.model,
-            row.model_version and int(row.model_version.partition(":")[0]),
-        ]
+        made = {
+            "is_active": today is not None and row.id == today.id,
+            "deviation_mm": figures.deviation_mm,
+            "uncertainty_mm": figures.uncertainty_mm,
+            "warnings": "; ".join(row.warnings or []),
+            "photographs": " ".join(one.identifier for one in row.measurements),
+            "model_version": row.model_version and int(row.model_version.partition(":")[0]),
+        }
+        yield [made[name] if name in made else getattr(row, name) for name in _SURFACE]
 
 
 @pages.get("/heliostats/{name}/surfaces.csv", dependencies=[READ, RENDER_SLOT])

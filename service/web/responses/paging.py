@@ -6,7 +6,7 @@ from typing import Annotated, Generic, Literal, TypeVar
 from fastapi import Query
 from pydantic import BaseModel, Field
 
-from service.base.fields import Moment
+from service.base.fields import Moment, Version
 
 Item = TypeVar("Item")
 
@@ -14,6 +14,7 @@ Since = Annotated[
     Moment | None, Query(description="Only those from this time on (time with zone).")
 ]
 Until = Annotated[Moment | None, Query(description="Only those before this time (time with zone).")]
+AfterId = Annotated[Version | None, Query(description="The last id of the page before.")]
 Direction = Literal["up", "down"]
 """Sort direction: "up" begins with the smallest or oldest item, "down" with the largest."""
 OrderQuery = Annotated[

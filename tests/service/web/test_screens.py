@@ -12,7 +12,7 @@ from model.ephemeris import sun_angles_at
 from service.drawing.charts import PlanePicture
 from service.drawing.timelines import Value, timeline
 from service.twin.alarms.field_filter import METRICS
-from service.web.pages.field_page import ColourEnds, colour_ends
+from service.web.resources.field import ColourEnds, colour_ends
 from service.web.resources.forecasts import time_of
 
 LIMITS = ColourEnds(95.0, 75.0)
