@@ -430,21 +430,13 @@ class JobView:
     calibration: CalibrationView | None = None
 
 
-PageNumber = Annotated[int, Query(ge=1, le=10**6)]
-
-
-def _view(
-    number: Number,
-    request: Request,
-    runtime: RuntimeDep,
-    kinds: KindsDep,
-    step: StepNumber = 0,
-    page: PageNumber = 1,
+def read_view(
+    runtime: Runtime, kinds: Kinds, number: int, step: int, begin: int, is_update: bool
 ) -> JobView:
     """Read a job. An update while it runs needs neither the payload nor the result."""
     with runtime.database.reading() as session:
         row = queue.get_summary(session, number)
-        if row.state not in queue.ENDED and "hx-request" in request.headers:
+        if is_update and row.state not in queue.ENDED:
             return JobView(job_summary(row))
         session.expunge(row)
         row = queue.get_job(session, number, arrays=True)
@@ -455,7 +447,7 @@ def _view(
             result,
             flux_map(row),
             aim_view(session, row, step),
-            calibration_view(session, row, result, (page - 1) * MOST),
+            calibration_view(session, row, result, begin),
         )
 
 
@@ -465,20 +457,22 @@ _LISTS = ("counts", "surfaces", "unchanged", "judged", "warnings")
 
 @pages.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
 def get_job_page(
-    view: Annotated[JobView, Depends(_view)],
+    number: Number,
     request: Request,
     runtime: RuntimeDep,
+    kinds: KindsDep,
     by: By = "name",
     step: StepNumber = 0,
-    page: PageNumber = 1,
+    page: Annotated[int, Query(ge=1, le=10**6)] = 1,
 ) -> HTMLResponse:
     """A job, which the page follows until it ends.
 
     The heliostats of a field forecast are sorted ``by`` their name or a factor, the least first.
     Of a plan of aims the maps of one ``step`` are shown, and of long lists one ``page``.
     """
+    begin, is_update = (page - 1) * MOST, "hx-request" in request.headers
+    view = read_view(runtime, kinds, number, step, begin, is_update)
     job, result, calibration = view.job, view.result, view.calibration
-    begin = (page - 1) * MOST
     mirrors, skipped = _mirrors(result, by), {} if calibration else result.get("skipped", {})
     lists = mirrors, skipped, *(result.get(name, ()) for name in ("surfaces", "unchanged"))
     longest = calibration.longest if calibration else max(map(len, lists))

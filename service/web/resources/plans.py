@@ -383,12 +383,12 @@ Number = Annotated[Version, Path(description="Id of the plan's job.")]
 
 def _list_context(
     runtime: RuntimeDep,
-    zone: ZoneDep,
     after: After = None,
     aims: Annotated[Version | None, Query(description="Job of an aim plan to fill in.")] = None,
     when: Annotated[When | None, Query(description="A time to fill in.")] = None,
 ) -> dict[str, object]:
     with runtime.database.reading() as session:
+        zone = plant_time_zone(session, runtime.settings.time_zone)
         asked = None if aims is None else plan_with(session, aims)
         return _context(runtime, session, zone, after, asked, when)
 
