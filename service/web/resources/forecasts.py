@@ -50,7 +50,6 @@ from service.jobs.kinds.field_forecasts import FleetForecastIn
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.store.listing import Order, Period
 from service.store.tables import ForecastRow, HeliostatRow, PlantRow
 from service.twin.alarms.measured_states import read_requested_states
 from service.twin.forecasts.aim_sources import plant_time_zone
@@ -64,7 +63,6 @@ from service.web.auth.dependencies import (
     READ,
     RENDER_SLOT,
     IdentityDep,
-    Limit,
     RuntimeDep,
     ZoneDep,
     require_json,
@@ -73,7 +71,7 @@ from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to, leave_for, render
-from service.web.responses.paging import AfterId, OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import ListQuery, Page, page
 from service.web.responses.representation import Maps
 
 
@@ -210,26 +208,29 @@ def post_forecast(request: ForecastIn, runtime: RuntimeDep, response: Response) 
     return forecast_summary(row)
 
 
+class ForecastsQuery(ListQuery):
+    """Which forecasts are listed, in the order of their creation by default."""
+
+    heliostat: Annotated[Name | None, Query(description="Only those of this heliostat.")] = None
+    target: Annotated[Name | None, Query(description="Only those on this target.")] = None
+
+
 @router.get("", responses=problems(404), dependencies=[READ])
 def list_forecasts(
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: AfterId = None,
-    heliostat: Annotated[Name | None, Query(description="Only those of this heliostat.")] = None,
-    target: Annotated[Name | None, Query(description="Only those on this target.")] = None,
-    since: Since = None,
-    until: Until = None,
-    order: OrderQuery = "up",
+    query: Annotated[ForecastsQuery, Query()], runtime: RuntimeDep
 ) -> Page[ForecastSummary]:
     """List forecasts, in the order of their creation."""
     with runtime.database.reading() as session:
-        of = None if heliostat is None else store.get_heliostat(session, heliostat)
-        made, direction = Period(since, until), Order(descending=order == "down")
         rows = store.list_forecasts(
-            session, limit + 1, after, of, target=target, created=made, order=direction
+            session,
+            query.limit + 1,
+            query.after,
+            None if query.heliostat is None else store.get_heliostat(session, query.heliostat),
+            target=query.target,
+            created=query.created,
+            order=query.by_id,
         )
-    items = [forecast_summary(row) for row in rows]
-    return page(items, limit)
+    return page([forecast_summary(row) for row in rows], query.limit)
 
 
 @router.get(

@@ -34,7 +34,6 @@ from service.jobs.kinds.plans import MAX_TIMES, map_name
 from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.store.listing import Order, Period
 from service.store.sizes import sizes
 from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
 from service.twin.forecasts.watts import loss_chain
@@ -45,7 +44,6 @@ from service.web.auth.dependencies import (
     RENDER_SLOT,
     IdentityDep,
     KindsDep,
-    Limit,
     PresentedDep,
     RuntimeDep,
     StoppingDep,
@@ -71,7 +69,7 @@ from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
 from service.web.responses.openapi import TEXT, arrays, problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import AfterId, OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 from service.web.responses.representation import Maps
 
 
@@ -220,25 +218,28 @@ pages = APIRouter(include_in_schema=False)
 _PAGE = 50
 
 
+class JobsQuery(ListQuery):
+    """Which jobs are listed, newest first by default."""
+
+    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None
+    kind: KindName = None
+    order: OrderQuery = "down"
+
+
 @router.get("", responses=problems(), dependencies=[READ])
-def list_jobs(
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: AfterId = None,
-    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
-    kind: KindName = None,
-    since: Since = None,
-    until: Until = None,
-    order: OrderQuery = "down",
-) -> Page[JobSummary]:
+def list_jobs(query: Annotated[JobsQuery, Query()], runtime: RuntimeDep) -> Page[JobSummary]:
     """List jobs, newest first. The complete job is at its `href`."""
     with runtime.database.reading() as session:
-        asked, direction = Period(since, until), Order(descending=order == "down")
         rows = queue.list_jobs(
-            session, limit + 1, after, state, kind, created=asked, order=direction
+            session,
+            query.limit + 1,
+            query.after,
+            query.state,
+            query.kind,
+            created=query.created,
+            order=query.by_id,
         )
-    items = [job_summary(row) for row in rows]
-    return page(items, limit)
+    return page([job_summary(row) for row in rows], query.limit)
 
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])
@@ -354,7 +355,7 @@ def get_jobs_page(
     request: Request, runtime: RuntimeDep, after: Annotated[Version | None, Query()] = None
 ) -> HTMLResponse:
     """Jobs, newest first."""
-    jobs = list_jobs(runtime, _PAGE, after)
+    jobs = list_jobs(JobsQuery(limit=_PAGE, after=after), runtime)
     return render(
         request,
         "jobs.html",

@@ -48,7 +48,6 @@ from service.drawing.study_report import VERDICTS, report_page
 from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
-from service.store.listing import Order, Period
 from service.store.tables import PlantRow, StudyRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant import model_versions
@@ -73,14 +72,13 @@ from service.web.auth.dependencies import (
     READ,
     RENDER_SLOT,
     IdentityDep,
-    Limit,
     RuntimeDep,
 )
 from service.web.resources.models import ModelOut, current_out, model_out
 from service.web.resources.study_charts import study_timelines
 from service.web.responses.openapi import TEXT, problems
 from service.web.responses.pages import go_to, go_to_job, render
-from service.web.responses.paging import AfterId, OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 
 router = APIRouter(tags=["studies"])
 pages = APIRouter(include_in_schema=False)
@@ -359,23 +357,28 @@ def _report(runtime: Runtime, number: int, crumbs: str) -> HTMLResponse:
 # --- lists and studies
 
 
+class StudiesQuery(ListQuery):
+    """Which studies are listed, newest first by default."""
+
+    verdict: Annotated[Verdict | None, Query(description="Only those of this verdict.")] = None
+    order: OrderQuery = "down"
+
+
 @router.get("/studies", responses=problems(), dependencies=[READ])
 def list_studies(
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: AfterId = None,
-    verdict: Annotated[Verdict | None, Query(description="Only those of this verdict.")] = None,
-    since: Since = None,
-    until: Until = None,
-    order: OrderQuery = "down",
+    query: Annotated[StudiesQuery, Query()], runtime: RuntimeDep
 ) -> Page[StudySummary]:
     """List studies, newest first."""
     with runtime.database.reading() as session:
-        made, direction = Period(since, until), Order(descending=order == "down")
         rows = store.list_studies(
-            session, limit + 1, after, verdict=verdict, created=made, order=direction
+            session,
+            query.limit + 1,
+            query.after,
+            verdict=query.verdict,
+            created=query.created,
+            order=query.by_id,
         )
-        return page(_summaries(session, rows), limit)
+        return page(_summaries(session, rows), query.limit)
 
 
 @pages.get("/studies", dependencies=[READ])
