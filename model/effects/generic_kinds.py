@@ -14,6 +14,7 @@ With the coefficients c_k of a photograph, its image f, places x on the target a
     add        f + peak(f) sum c_k p_k(x)
     heights    trace of the mirror with heights sum c_k z_k
     light      trace of the mirror with its light times 1 + sum c_k p_k
+    places     trace of the mirror with facets moved by sum c_k x_k
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +38,7 @@ from model.tracing.scene import COVERAGE_CELLS
 Array = NDArray[np.float64]
 Place = Literal["mirror", "angle", "camera", "target", "geometry", "added_light"]
 Owner = Literal["all", "heliostat", "camera", "target"]
-Operator = Literal["transfer", "warp", "scale", "add", "heights", "light"]
+Operator = Literal["transfer", "warp", "scale", "add", "heights", "light", "places"]
 
 MAX_FACETS = 6
 """Largest number of facets that have separate components."""
@@ -185,7 +186,7 @@ class GenericKind:
     basis : callable or None
         Functions h, u or p of the notes, (n, ...) for each component; None for mirrors.
     weights : (K, F, L) or None
-        Share of each of `ORDERS`, or of light and its slopes, in each facet's change.
+        Share of each of `ORDERS`, of light and its slopes, or of x and y, in each facet's change.
     is_smooth : bool
         Whether it may scale with covariates.
     """
@@ -291,6 +292,7 @@ _SHADES = _components("1", "right, up, right2, right up, up2")
 _WAVES = _components("1", ", ".join(f"wave {i} {j}" for i in range(8) for j in range(8) if i + j))
 _STRIPES = _components("1", ", ".join(f"wave {i} {way}" for way in ("right", "up") for i in FINE))
 _WAVER = _components("m", ", ".join(f"wave {i} up" for i in FINE))
+_SPREAD = _components("m", "apart along x, apart along y")
 _LIGHTS = _components("1", "even, to the right, upwards, to the rim, halo")
 
 IMAGE_KINDS = (
@@ -310,7 +312,7 @@ IMAGE_KINDS = (
 
 def mirror_kinds(facets: Array) -> list[GenericKind]:
     """Kinds of mirrors with facets centred at (F, 2) [m]: of the whole mirror, of all facets alike,
-    and of single facets of mirrors that have few.
+    of single facets of mirrors that have few, and of the gaps between them.
     """
     heights = np.array([[_share(order, part, facets) for part in ORDERS] for order in ORDERS])
     whole = heights.transpose(0, 2, 1)[2:]
@@ -321,8 +323,11 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
             kinds.append(
                 _heights(f"{name}{', fine' * fine}", ORDERS[2 : 2 + count], weights[:count])
             )
+    reach = np.abs(facets).max(axis=0).clip(min=1e-9)
+    spread = np.eye(2)[:, None] * (facets / reach)
+    places = GenericKind("places", "mirror", "places", _SPREAD, weights=spread)
     if len(facets) > MAX_FACETS:
-        return kinds
+        return [*kinds, places]
     for fine, count in ((False, 5), (True, 9)):
         weights = np.zeros((len(facets), count, len(facets), len(ORDERS)))
         for facet in range(len(facets)):
@@ -338,7 +343,7 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
         for facet in range(len(facets))
         for way in ("", " along x", " along y")
     ]
-    return [*kinds, GenericKind("light", "mirror", "light", tuple(names), weights=light)]
+    return [*kinds, GenericKind("light", "mirror", "light", tuple(names), weights=light), places]
 
 
 def _share(order: tuple[int, int], part: tuple[int, int], facets: Array) -> Array:
@@ -405,7 +410,10 @@ def deformed(scene: Scene, kinds: Sequence[GenericKind], amounts: Tensor) -> Sce
         return _lit(scene, shares)
     points = scene.control_points.expand(scene.batch, -1, -1, -1, -1).double()
     changes = torch.zeros_like(points)
-    changes[:, :, 2] = torch.einsum("nfl,lij->nfij", shares, height_shapes(scene))
+    if kinds[0].operator == "places":
+        changes[:, :, :2] = shares[..., None, None]
+    else:
+        changes[:, :, 2] = torch.einsum("nfl,lij->nfij", shares, height_shapes(scene))
     return scene.with_(control_points=(points + changes).to(scene.control_points))
 
 

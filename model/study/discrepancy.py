@@ -8,15 +8,16 @@ photograph n are linear in a covariate z of zero mean and unit variance::
     c_n = b_0[owner] + b_1[owner] z_n                      b_0 alone for the scaling "constant"
     b   = argmin sum_n |r_n - D_n c_n|**2 + ridge |b|**2   r, D in shares of photographs' peaks
 
-All terms are compared by cross-validation on the fitted photographs. The best is fitted by
-Gauss-Newton with exact changes of the forecasts, and further terms are added to it. Held-out
+All terms are compared by cross-validation on the fitted photographs, those of the best kinds after
+Gauss-Newton with exact changes of the forecasts. Further terms are added to the best. Held-out
 photographs judge the sum. Source of the ridge and its cross-validation: Hastie, Tibshirani and
 Friedman, *The Elements of Statistical Learning* (2009), sections 3.4.1 and 7.10.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain, groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,7 +61,7 @@ MIN_SHARE = 0.1
 """Smallest share of the excess error that a further term must gain in cross-validation."""
 
 SCREENED = 5
-"""Number of the best terms that are compared at all ridges."""
+"""Number of the best kinds whose best terms are fitted by Gauss-Newton, with all ridges."""
 
 MIN_PROGRESS = 1e-4
 """Smallest gain of accuracy by a step of Gauss-Newton after the first."""
@@ -338,6 +339,11 @@ class Discrepancy:
         return self.terms[0].choice.term.kind.lives_in if is_located else None
 
     @property
+    def n_coefficients(self) -> int:
+        """Number of coefficients of all terms."""
+        return sum(one.coefficients.size for one in self.terms)
+
+    @property
     def described(self) -> str:
         """The first term in words."""
         return self.terms[0].choice.term.described
@@ -488,26 +494,41 @@ class _Search:
         ]
 
     def best(self, cuts: Array) -> TermChoice:
-        """The simplest of the best terms."""
+        """The simplest of the best terms.
+
+        All are compared in the linear model of their kind. Then the best term of each of the best
+        kinds is fitted by Gauss-Newton, for strong changes of mirrors are not linear.
+        """
         before = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
-        points = {kind.name: self.linearise(kind, cuts) for kind in self.model.kinds}
-        fitted = {name: point.subset(self.is_fitted) for name, point in points.items()}
 
-        def choose(term: GenericTerm, ridge: float) -> TermChoice:
-            gain = self.cross_validated(term, fitted[term.kind.name], ridge) - before
-            return TermChoice(term, ridge, gain, points[term.kind.name])
+        def choices(
+            terms: Iterable[GenericTerm], point: Linearised, ridges: Sequence[float]
+        ) -> list[TermChoice]:
+            part = point.subset(self.is_fitted)
+            pairs = ((term, ridge) for term in terms for ridge in ridges)
+            return [
+                TermChoice(term, ridge, self.cross_validated(term, part, ridge) - before, point)
+                for term, ridge in pairs
+            ]
 
-        screened = sorted(
-            (choose(term, RIDGES[1]) for term in self.terms()), key=lambda choice: -choice.gain
-        )
-        few = [choose(one.term, ridge) for one in screened[:SCREENED] for ridge in RIDGES]
-        best = max(few, key=lambda choice: choice.gain)
-        chosen = min(
-            (choice for choice in few if choice.gain >= SIMPLER * best.gain),
-            key=lambda choice: (self._complexity(choice.term), -choice.gain),
-            default=best,
-        )
-        return replace(chosen, rival=find_rival(self, chosen, screened))
+        by_kind = [
+            choices(terms, self.linearise(kind, cuts), RIDGES[1:2])
+            for kind, terms in groupby(self.terms(), key=lambda term: term.kind)
+        ]
+        screened = sorted(map(self._simplest, by_kind), key=lambda one: -one.gain)
+        finalists: list[TermChoice] = []
+        for one in screened[:SCREENED]:
+            point = self.iterate(one.term, one.ridge, cuts, one.point).point
+            finalists += choices([one.term], point, RIDGES)
+        chosen = self._simplest(finalists)
+        others = sorted([*finalists, *chain(*by_kind)], key=lambda one: -one.gain)
+        return replace(chosen, rival=find_rival(self, chosen, others))
+
+    def _simplest(self, choices: Sequence[TermChoice]) -> TermChoice:
+        """The one of fewest coefficients among those that gain nearly as much as the best."""
+        best = max(choices, key=lambda one: one.gain)
+        good = [one for one in choices if one.gain >= SIMPLER * best.gain]
+        return min(good or [best], key=lambda one: (self._complexity(one.term), -one.gain))
 
     def _complexity(self, term: GenericTerm) -> int:
         """Number of a term's coefficients."""

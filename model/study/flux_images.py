@@ -15,7 +15,7 @@ from model.covariates import slant_range
 from model.effects import Effect, Stage, effect_to_json, effects_of_stage
 from model.errors import InvalidInputError
 from model.forecast import Aligned, View, align
-from model.frames import sun_angles
+from model.frames import SOLAR_DISC, sun_angles
 from model.images import FLUX_SIZE, clipped_alike
 from model.imaging.window import overlap_matrix
 from model.metrics import accuracy_window
@@ -25,11 +25,17 @@ from model.pointing.mounts import CalibratedMount
 from model.pointing.spots import observe_angles
 from model.progress import nothing_between
 from model.setup import Setup
-from model.study.noise import black_lift, grain_variance
+from model.study.noise import black_lift, grain_variance, without_spikes
 from model.study.parameters import copied, copy_name
 from model.study.position import USUAL_RAD, whiten
 
 Array = NDArray[np.float64]
+
+MIN_DISC = 10
+"""Smallest number of pixels across the sun's disc with which nothing real looks like a spike."""
+
+MIN_SPIKES = 1e-3
+"""Share of the light below which spikes remain: those of noise have up to half of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +62,8 @@ class FluxImage:
     spot_shifts_rad : (2, K) [rad] or None
         Spot shifts, sidewards and upwards, by K independent deviations of the mount's calibration.
         The deviations are the same for all photographs of a heliostat.
+    spike_share : float [1]
+        Share of the light that hot and dead pixels had added or taken.
     """
 
     setup: Setup
@@ -65,6 +73,7 @@ class FluxImage:
     sheet_share: float = 0.0
     spot_std_rad: float = USUAL_RAD
     spot_shifts_rad: Array | None = None
+    spike_share: float = 0.0
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or not np.isfinite(self.image).all() or not self.image.sum() > 0:
@@ -119,6 +128,16 @@ class FluxImage:
         return replace(
             self, setup=setup, spot_std_rad=observed.std_rad, spot_shifts_rad=observed.shared_rad
         )
+
+    def without_spikes(self) -> "FluxImage":
+        """Take hot and dead pixels from their neighbours, if the sun's disc covers many pixels."""
+        plane = self.setup.plane
+        pixel = max(plane.height / self.image.shape[0], plane.width / self.image.shape[1])
+        if 2 * SOLAR_DISC * self.slant_range < MIN_DISC * pixel:
+            return self
+        image = without_spikes(np.asarray(self.image, dtype=np.float64))
+        share = float(np.abs(image - self.image).sum() / self.image.sum())
+        return replace(self, image=image, spike_share=share) if share > MIN_SPIKES else self
 
     def noise_share(self, window: float) -> float:
         """The error that grain and sheet alone cause, in a cut of side ``window`` [m]."""

@@ -40,6 +40,9 @@ Array = NDArray[np.float64]
 AT_ONCE = 8
 """Photographs whose derivatives are in memory at once."""
 
+STEP = 0.02
+"""Movement [m] of facets in the finite difference for their places."""
+
 
 class GenericModel:
     """Applies generic terms to the forecasts of photographs under some effects."""
@@ -119,7 +122,7 @@ class GenericModel:
     def _applied(
         self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
     ) -> Array:
-        if kind.operator == "heights":
+        if kind.operator in ("heights", "places"):
             return np.asarray(spots.images + self.mirrors.deformation(kind, rows, coefficients))
         if kind.basis is None:
             changes = self.mirrors.changes(kind, rows, coefficients)
@@ -173,6 +176,14 @@ class MirrorModel:
                 )
             if any(kind.operator == "light" for kind in kinds):
                 found.append(_light_changes(scene, window, optics, view))
+            for kind in kinds:
+                if kind.operator == "places":
+                    steps = STEP * torch.eye(len(kind.components)).double()
+                    moved = (
+                        deformed(scene, [kind], step.expand(scene.batch, -1)) for step in steps
+                    )
+                    images = [view.trace(one, window, optics)[None] for one in moved]
+                    found += [(image - found[0]) / STEP for image in images]
             return torch.cat(found)
 
         return self._each_part(rows, coefficients, trace)[1:]

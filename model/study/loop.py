@@ -21,6 +21,11 @@ from model.study.trials import StudyOptions, Trial, TrialFitter
 
 MIN_IMAGES = 4
 
+FEWER, MIN_UNKNOWN = 4, 2
+"""A generic term contradicts effects that gain no more with so many times its coefficients; the
+simplest terms have two.
+"""
+
 
 def study(
     flux_images: Sequence[FluxImage],
@@ -49,6 +54,7 @@ def study(
     """
     options = options or StudyOptions()
     _check(flux_images)
+    flux_images = [p.without_spikes() for p in flux_images]
     fitter = TrialFitter(flux_images, model, options)
     _check_own(flux_images, model, options)
     scopes = ScopeSearch(fitter)
@@ -189,21 +195,28 @@ def _contradict(
     if outcome.leaves_little:
         progress("halves of the photographs")
         reasons = [f"{term.kind.name} drifts" for term in find_drifts(fitter, current)]
-    if outcome.found and outcome.unexplained_share <= MIN_RIVAL and not reasons:
-        return outcome  # no term can gain what would contradict them
+    n_unknown = len(current.parameters.all)
+    is_certain = outcome.unexplained_share <= MIN_RIVAL and n_unknown < FEWER * MIN_UNKNOWN
+    if outcome.found and is_certain and not reasons:
+        return outcome  # no term can gain what would contradict them, nor say the same in fewer
     if not outcome.found and not outcome.has_unexplained_error:
         return outcome
     progress("terms outside the catalogue")
     discrepancy = find_discrepancy(fitter, before, outcome.noise_floor)
+    least = MIN_RIVAL * outcome.excess_error
     if outcome.leaves_little and outcome.has_unexplained_error:
-        least = MIN_RIVAL * outcome.excess_error
         added = find_discrepancy(fitter, current, outcome.noise_floor, max_terms=1)
         if added is not None and added.gain.mean >= least:
             reasons.append(f"{added.described} gains more")
-        if discrepancy is not None:
-            change = paired_gain(discrepancy.accuracy - current.accuracy, fitter.judged_heliostats)
-            if change.low > 0 and change.mean >= least:
-                reasons.append(f"{discrepancy.described} alone gains more")
+    if outcome.leaves_little and discrepancy is not None:
+        change = paired_gain(discrepancy.accuracy - current.accuracy, fitter.judged_heliostats)
+        if change.low > 0 and change.mean >= least:
+            reasons.append(f"{discrepancy.described} alone gains more")
+        elif change.mean >= -least and n_unknown >= FEWER * discrepancy.n_coefficients:
+            reasons.append(
+                f"{discrepancy.described} gains as much with {discrepancy.n_coefficients}"
+                f" coefficients in place of {n_unknown}"
+            )
     judged = replace(outcome, contradicted_by=reasons)
     return judged if judged.verdict == "effect" else replace(judged, discrepancy=discrepancy)
 

@@ -1,7 +1,8 @@
 """The noise of a photograph, read from the photograph alone.
 
 Grain is what no smooth light explains. What is cut at black leaves no grain but a lift: where there
-is no light, noise below zero is lost and noise above it stays.
+is no light, noise below zero is lost and noise above it stays. Hot and dead pixels are no grain:
+their neighbours say what they should show (`without_spikes`).
 
 Notes
 -----
@@ -11,12 +12,14 @@ Notes
     variance(level) = line through the means of g      read noise, rounding and counting
     lift = sigma (phi(a) - a Phi(-a)),  Phi(-a) = share of black pixels   (`black_lift`)
 
+    spike: |image - median| > SPIKE s(level)           s by the 90 % quantile at a level
+
 Sources: Immerkaer (1996), doi:10.1006/cviu.1996.0060, and Tobin (1958), doi:10.2307/1907382.
 """
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.ndimage import maximum_filter, median_filter, uniform_filter
 from scipy.stats import norm
 
 Array = NDArray[np.float64]
@@ -30,11 +33,35 @@ MIN_BLACK = 0.01
 BLOCK = 9
 """Pixels a side over which the share of black ones is counted."""
 
+AROUND = 5
+"""Pixels a side of the surroundings whose median a spike takes: spikes of up to 3 x 3 are found."""
 
-def grain_variance(image: Array, spacing: int = SPACING, bins: int = 12) -> Array:
+SPIKE = 6.0
+"""Deviation from that median, in standard deviations, beyond which a pixel is a spike."""
+
+LEVELS = 12
+"""Number of parts of an image, by intensity, each with its own noise."""
+
+
+def without_spikes(image: Array) -> Array:
+    """The image (rows, columns) whose spikes have the median of their surroundings.
+
+    Its light must be smooth over `AROUND` pixels.
+    """
+    smooth = median_filter(image, AROUND)
+    off, found = np.abs(image - smooth).ravel(), image.copy().ravel()
+    step = off[off > 0].min(initial=np.inf)  # of levels, where most pixels are cut at black
+    for part in np.array_split(np.argsort(smooth, axis=None), LEVELS):
+        usual = max(np.quantile(off[part], 0.9) / norm.ppf(0.95), step)
+        spikes = part[off[part] > SPIKE * usual]
+        found[spikes] = smooth.ravel()[spikes]
+    return found.reshape(image.shape)
+
+
+def grain_variance(image: Array, spacing: int = SPACING) -> Array:
     """Variance of each pixel's noise (rows, columns), which is linear in its intensity."""
     grain, inner = _grain(image, spacing), image[spacing:-spacing, spacing:-spacing]
-    parts = np.array_split(np.argsort(inner, axis=None), bins)
+    parts = np.array_split(np.argsort(inner, axis=None), LEVELS)
     levels = np.array([inner.ravel()[part].mean() for part in parts])
     variances = np.array([grain.ravel()[part].mean() for part in parts])
     lever = levels - levels.mean()

@@ -228,6 +228,11 @@ class Study:
         return noise_floor(self.images, self.window)
 
     @property
+    def spike_share(self) -> float:
+        """Mean share of the light of the images that hot and dead pixels had added or taken."""
+        return float(np.mean([image.spike_share for image in self.images]))
+
+    @property
     def unexplained_share(self) -> float:
         """Share of the error beyond noise that the effects found leave; zero if it is small."""
         first = self.excess_error

@@ -18,6 +18,11 @@ def conclude(study: Study) -> str:
             f" {study.pattern.depth:.1%} of the light, at the same places of the target in all"
             " photographs."
         )
+    if study.spike_share:
+        conclusion += (
+            f" Hot or dead pixels have {study.spike_share:.1%} of the light; the study took them"
+            " from their neighbours. Repair or mask them in the camera."
+        )
     if not study.n_in_sample:
         return conclusion
     return (

@@ -21,6 +21,7 @@ from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
 from model.forecast import View, align
 from model.frames import sun_direction
+from model.images import binned
 from model.metrics import flux_accuracies
 from model.plant import Heliostat
 from model.plant_model import JUELICH_MODEL
@@ -231,6 +232,28 @@ def test_the_noise_of_an_image_is_read_from_its_grain():
     bright = light > 0.5
     np.testing.assert_allclose(found[bright].mean(), truth[bright].mean(), rtol=0.1)
     assert grain_variance(light, spacing=1).mean() < 0.01 * truth.mean()
+
+
+def test_hot_and_dead_pixels_are_taken_from_their_neighbours(hazy):
+    rng = np.random.default_rng(1)
+    rows, columns = rng.integers(2, 250, (2, 100))
+    broken = []
+    for one in hazy:
+        image = one.image / one.image.max()
+        spiked = image.copy()
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+            spiked[row : row + 2, column : column + 2] += rng.choice([0.3, -0.2])
+        broken.append(replace(one, image=spiked))
+        assert one.without_spikes() is one
+        repaired = broken[-1].without_spikes()
+        assert repaired.spike_share > 0.01
+        spoiled = np.abs(broken[-1].image - image).sum()
+        assert np.abs(repaired.image - image).sum() < 0.2 * spoiled
+    found = study(broken, JUELICH_MODEL, options=QUICK)
+    assert [one.name for one in found.found] == ["sun_shape"]
+    assert "Hot or dead pixels have" in conclude(found)
+    far = replace(broken[0], image=binned(broken[0].image, 16))
+    assert far.without_spikes() is far
 
 
 CAMERAS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {

@@ -181,7 +181,8 @@ class Exposure:
 
     def light(self, points: Points) -> Array:
         """Share (n,) of the light that points reflect and that nothing takes away."""
-        line = (self._own(self.world.hidden) - 0.5) * self.heliostat.height
+        height = self.heliostat.height + self.world.gap_m
+        line = (self._own(self.world.hidden) - 0.5) * height
         light = self._own(self.world.reflectivity, 4)[points.facets] * (points.places[1] >= line)
         middles = np.array([facet.position[1] for facet in self.heliostat.facets])
         halves = np.array([facet.half[1] for facet in self.heliostat.facets])
