@@ -49,8 +49,11 @@ FINE = range(1, 21)
 _STEP = 1e-4
 """Angle [rad] of the finite difference for the movement of beams with a mount's axis."""
 
-ORDERS = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+ORDERS = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3), (4, 0), (0, 4))
 """Powers of x and y of height changes; tilts, curvatures, and finer modes."""
+
+LIGHT_ORDERS = ((0, 0), *ORDERS)
+"""Powers of x and y of changes of a facet's light, which span -1 to 1 over the facet."""
 
 
 class Component(NamedTuple):
@@ -186,7 +189,7 @@ class GenericKind:
     basis : callable or None
         Functions h, u or p of the notes, (n, ...) for each component; None for mirrors.
     weights : (K, F, L) or None
-        Share of each of `ORDERS`, of light and its slopes, or of x and y, in each facet's change.
+        Share of each of `ORDERS`, of `LIGHT_ORDERS`, or of x and y, in each facet's change.
     is_smooth : bool
         Whether it may scale with covariates.
     """
@@ -316,18 +319,21 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
     """
     heights = np.array([[_share(order, part, facets) for part in ORDERS] for order in ORDERS])
     whole = heights.transpose(0, 2, 1)[2:]
-    alike = np.repeat(np.eye(len(ORDERS))[2:, None], len(facets), axis=1)
+    each = np.repeat(np.eye(len(ORDERS))[2:, None], len(facets), axis=1)
     kinds = []
-    for name, weights in (("mirror", whole), ("each facet", alike)):
-        for fine, count in ((False, 3), (True, 7)):
+    for name, weights in (("mirror", whole), ("each facet", each)):
+        for fine, count in ((False, 3), (True, len(ORDERS) - 2)):
             kinds.append(
                 _heights(f"{name}{', fine' * fine}", ORDERS[2 : 2 + count], weights[:count])
             )
     reach = np.abs(facets).max(axis=0).clip(min=1e-9)
     spread = np.eye(2)[:, None] * (facets / reach)
     places = GenericKind("places", "mirror", "places", _SPREAD, weights=spread)
+    names = tuple(Component(f"light along {'x' * i}{'y' * j}", "1") for i, j in ORDERS)
+    even = np.repeat(np.eye(len(LIGHT_ORDERS))[1:, None], len(facets), axis=1)
+    alike = GenericKind("each facet's light", "mirror", "light", names, weights=even)
     if len(facets) > MAX_FACETS:
-        return [*kinds, places]
+        return [*kinds, alike, places]
     for fine, count in ((False, 5), (True, 9)):
         weights = np.zeros((len(facets), count, len(facets), len(ORDERS)))
         for facet in range(len(facets)):
@@ -337,13 +343,16 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
                 f"facets{', fine' * fine}", ORDERS[:count], weights.reshape(-1, *weights.shape[2:])
             )
         )
-    light = np.eye(3 * len(facets)).reshape(-1, len(facets), 3)
-    names = [
+    single = np.zeros((len(facets), 3, len(facets), len(LIGHT_ORDERS)))
+    for facet in range(len(facets)):
+        single[facet, :, facet, :3] = np.eye(3)
+    names = tuple(
         Component(f"light{way} of facet {facet + 1}", "1")
         for facet in range(len(facets))
         for way in ("", " along x", " along y")
-    ]
-    return [*kinds, GenericKind("light", "mirror", "light", tuple(names), weights=light), places]
+    )
+    light = single.reshape(-1, *single.shape[2:])
+    return [*kinds, GenericKind("light", "mirror", "light", names, weights=light), alike, places]
 
 
 def _share(order: tuple[int, int], part: tuple[int, int], facets: Array) -> Array:
@@ -355,7 +364,7 @@ def _share(order: tuple[int, int], part: tuple[int, int], facets: Array) -> Arra
 
 
 def _heights(name: str, orders: Sequence[tuple[int, int]], weights: Array) -> GenericKind:
-    units = {1: "mrad", 2: "mrad/m", 3: "mrad/m2"}
+    units = {1: "mrad", 2: "mrad/m", 3: "mrad/m2", 4: "mrad/m3"}
     several = len(weights) // len(orders)
     components = tuple(
         Component(
@@ -399,6 +408,13 @@ def height_shapes(scene: Scene) -> Tensor:
     return torch.stack([1e-3 * x**i * y**j / (factorial(i) * factorial(j)) for i, j in ORDERS])
 
 
+def light_shapes(count: int) -> Tensor:
+    """Changes (L, count, count) of a facet's light, along x and y, by `LIGHT_ORDERS`."""
+    line = (torch.arange(count, dtype=torch.float64) + 0.5) / count * 2 - 1
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([x**i * y**j for i, j in LIGHT_ORDERS])
+
+
 def deformed(scene: Scene, kinds: Sequence[GenericKind], amounts: Tensor) -> Scene:
     """The scene with mirrors that have amounts (n, K) of a kind.
 
@@ -418,10 +434,8 @@ def deformed(scene: Scene, kinds: Sequence[GenericKind], amounts: Tensor) -> Sce
 
 
 def _lit(scene: Scene, shares: Tensor) -> Scene:
-    """The scene with shares (n, F, 3) of light and its slopes, and as much light in sum."""
-    line = ((torch.arange(COVERAGE_CELLS) + 0.5) / COVERAGE_CELLS * 2 - 1).to(shares)
-    slopes = torch.stack(torch.meshgrid(line, line, indexing="ij"))
-    along = torch.cat([torch.ones_like(slopes[:1]), slopes])
+    """The scene with shares (n, F, L) of light by `LIGHT_ORDERS`, and as much light in sum."""
+    along = light_shapes(COVERAGE_CELLS).to(shares)
     light = (1 + torch.einsum("nfl,lij->nfij", shares, along)).clamp(min=0)
     light = (light / light.mean(dim=(1, 2, 3), keepdim=True)).to(scene.sun)
     before = scene.coverage

@@ -60,14 +60,19 @@ MAX_TERMS = 3
 MIN_SHARE = 0.1
 """Smallest share of the excess error that a further term must gain in cross-validation."""
 
-SCREENED = 5
+SCREENED = 8
 """Number of the best kinds whose best terms are fitted by Gauss-Newton, with all ridges."""
 
 MIN_PROGRESS = 1e-4
 """Smallest gain of accuracy by a step of Gauss-Newton after the first."""
 
-SIMPLER = 0.98
-"""Share of the best term's gain for which a term of fewer coefficients is preferred."""
+SIMPLER, SIMPLER_LINEAR = 0.98, 0.95
+"""Shares of the best term's gain for which a term of fewer coefficients is preferred, after
+Gauss-Newton and in the linear model, which is rough.
+"""
+
+MIN_VARIED = 0.1
+"""Smallest deviation of a covariate within an owner, of that of all, for a scaling of its own."""
 
 LOCATED = 0.2
 """Largest share of the excess error that may stay unexplained where a discrepancy is located."""
@@ -491,7 +496,15 @@ class _Search:
             for owner in kind.owners
             if owner in ("all", "camera") or len(self.owners[owner][0]) > 1
             for scaling in (None, *(self.covariates if kind.is_smooth else []))
+            if scaling is None or self._varies(scaling, owner)
         ]
+
+    def _varies(self, covariate: Covariate, owner: Owner) -> bool:
+        """Whether a covariate varies in the fitted photographs of an owner."""
+        values, own = self.covariates[covariate], self.owners[owner][1]
+        each = [values[self.is_fitted & (own == one)] for one in np.unique(own)]
+        usual = float(np.median([np.std(some) for some in each if len(some)]))
+        return usual > MIN_VARIED * self.scale(covariate).std
 
     def best(self, cuts: Array) -> TermChoice:
         """The simplest of the best terms.
@@ -515,19 +528,20 @@ class _Search:
             choices(terms, self.linearise(kind, cuts), RIDGES[1:2])
             for kind, terms in groupby(self.terms(), key=lambda term: term.kind)
         ]
-        screened = sorted(map(self._simplest, by_kind), key=lambda one: -one.gain)
+        simplest = (self._simplest(own, SIMPLER_LINEAR) for own in by_kind)
+        screened = sorted(simplest, key=lambda one: -one.gain)
         finalists: list[TermChoice] = []
         for one in screened[:SCREENED]:
             point = self.iterate(one.term, one.ridge, cuts, one.point).point
             finalists += choices([one.term], point, RIDGES)
-        chosen = self._simplest(finalists)
+        chosen = self._simplest(finalists, SIMPLER)
         others = sorted([*finalists, *chain(*by_kind)], key=lambda one: -one.gain)
         return replace(chosen, rival=find_rival(self, chosen, others))
 
-    def _simplest(self, choices: Sequence[TermChoice]) -> TermChoice:
-        """The one of fewest coefficients among those that gain nearly as much as the best."""
+    def _simplest(self, choices: Sequence[TermChoice], share: float) -> TermChoice:
+        """The one of fewest coefficients among those that gain this share of the best one's."""
         best = max(choices, key=lambda one: one.gain)
-        good = [one for one in choices if one.gain >= SIMPLER * best.gain]
+        good = [one for one in choices if one.gain >= share * best.gain]
         return min(good or [best], key=lambda one: (self._complexity(one.term), -one.gain))
 
     def _complexity(self, term: GenericTerm) -> int:

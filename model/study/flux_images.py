@@ -31,8 +31,10 @@ from model.study.position import USUAL_RAD, whiten
 
 Array = NDArray[np.float64]
 
-MIN_DISC = 10
-"""Smallest number of pixels across the sun's disc with which nothing real looks like a spike."""
+MIN_DISC, MIN_SIDE = 10, 64
+"""Smallest numbers of pixels across the sun's disc and the image for which spikes are looked for:
+there nothing real looks like one.
+"""
 
 MIN_SPIKES = 1e-3
 """Share of the light below which spikes remain: those of noise have up to half of it."""
@@ -131,9 +133,9 @@ class FluxImage:
 
     def without_spikes(self) -> "FluxImage":
         """Take hot and dead pixels from their neighbours, if the sun's disc covers many pixels."""
-        plane = self.setup.plane
-        pixel = max(plane.height / self.image.shape[0], plane.width / self.image.shape[1])
-        if 2 * SOLAR_DISC * self.slant_range < MIN_DISC * pixel:
+        plane, shape = self.setup.plane, self.image.shape
+        pixel = max(plane.height / shape[0], plane.width / shape[1])
+        if min(shape) < MIN_SIDE or 2 * SOLAR_DISC * self.slant_range < MIN_DISC * pixel:
             return self
         image = without_spikes(np.asarray(self.image, dtype=np.float64))
         share = float(np.abs(image - self.image).sum() / self.image.sum())

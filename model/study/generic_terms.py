@@ -24,6 +24,7 @@ from model.effects.generic_kinds import (
     changed_images,
     deformed,
     height_shapes,
+    light_shapes,
     mirror_kinds,
 )
 from model.forecast import Aligned, View
@@ -161,7 +162,10 @@ class MirrorModel:
     ) -> Array:
         """Changes (K, n, 64, 64) by all kinds of mirrors that have coefficients of the first."""
         view, (first, *_) = self.view, kinds
-        heights = [np.asarray(k.weights) for k in kinds if k.operator == "heights"]
+        heights, light = (
+            [np.asarray(kind.weights) for kind in kinds if kind.operator == operator]
+            for operator in ("heights", "light")
+        )
 
         def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
             shapes = height_shapes(scene)
@@ -174,8 +178,9 @@ class MirrorModel:
                 found.append(
                     by_heights(scene, window, optics, samples=view.samples, padding=view.padding)
                 )
-            if any(kind.operator == "light" for kind in kinds):
-                found.append(_light_changes(scene, window, optics, view))
+            if light:
+                weights = torch.as_tensor(np.concatenate(light)).to(scene.sun)
+                found.append(_light_changes(scene, window, optics, view, weights))
             for kind in kinds:
                 if kind.operator == "places":
                     steps = STEP * torch.eye(len(kind.components)).double()
@@ -224,24 +229,24 @@ class MirrorModel:
         return np.asarray(images / images[0].sum(axis=(1, 2), keepdims=True))
 
 
-def _light_changes(scene: Scene, window: Window, optics: Optics, view: View) -> Tensor:
-    """Changes (F * 3, n, R, C) of irradiance by each facet's light and its slopes along x and y."""
+def _light_changes(
+    scene: Scene, window: Window, optics: Optics, view: View, weights: Tensor
+) -> Tensor:
+    """Changes (K, n, R, C) of irradiance by facets' light with ``weights`` (K, F, L)."""
     rays = central_rays(scene, view.samples)
     optics = optics_of(scene, optics)
     irradiance = irradiance_of(scene, optics, rays.slant_range)
     on_grid = raster(rays, rays.spot, window, optics, irradiance, (view.padding, view.padding))
-    line = (torch.arange(view.samples).to(rays.power) + 0.5) / view.samples * 2 - 1
-    along = [torch.ones(view.samples, view.samples), *torch.meshgrid(line, line, indexing="ij")]
-    facets = scene.control_points.shape[1]
-    images = []
-    for facet in range(facets):
-        for shares in along:
-            x, y, weight = (
-                rays.view(scene.batch, facets, -1)[:, facet]
-                for rays in (on_grid.x, on_grid.y, on_grid.weight)
-            )
-            images.append(splat(x, y, weight * shares.flatten().to(weight), *on_grid.shape))
-    return on_grid.blurred(torch.stack(images))
+    shapes = light_shapes(view.samples).flatten(1).to(rays.power)
+    changes: Tensor | float = 0.0
+    for facet, amounts in enumerate(weights.unbind(1)):
+        x, y, weight = (
+            rays.view(scene.batch, weights.shape[1], -1)[:, facet]
+            for rays in (on_grid.x, on_grid.y, on_grid.weight)
+        )
+        images = [splat(x, y, weight * shares, *on_grid.shape) for shares in shapes]
+        changes = changes + torch.einsum("kl,lnij->knij", amounts, torch.stack(images))
+    return on_grid.blurred(torch.as_tensor(changes))
 
 
 class _LightMoves(NamedTuple):
