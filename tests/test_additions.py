@@ -21,7 +21,7 @@ DOCS = ROOT / "docs"
 EXTENDING = DOCS / "how-to" / "developer" / "extend.md"
 
 FILES = {
-    "REST resource": "service/web/api/greetings.py",
+    "REST resource": "service/web/resources/greetings.py",
     "job kind": "service/jobs/kinds/doublings.py",
     "page": "service/web/pages/hello.py",
     "CLI verb": "heliotwin/cli/verbs/greet.py",

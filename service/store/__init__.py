@@ -19,6 +19,7 @@ from service.store.photographs.measurements import (
     use_image,
 )
 from service.store.plant.geometry import (
+    count_photographs,
     find_heliostat,
     find_plant,
     find_receiver,
@@ -97,6 +98,7 @@ __all__ = [
     "add_position",
     "add_study",
     "add_surface",
+    "count_photographs",
     "counts",
     "current_surfaces",
     "find_candidate",

@@ -468,7 +468,7 @@ class ForecastRow(Base):
     """A computed flux map: its inputs and key figures, and npz ``flux`` (rows, columns) float32
     [W/m2].
 
-    ``document`` has the other fields of `service.web.api.forecasts.ForecastSummary`.
+    ``document`` has the other fields of `service.web.resources.forecasts.ForecastSummary`.
     """
 
     __tablename__ = "forecasts"

@@ -23,7 +23,6 @@ from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.runtime.runtime import Operations, Runtime
 from service.twin.runtime.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache
-from service.web.api import jobs
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter
 from service.web.auth.fair_limiter import FairLimiter
@@ -37,6 +36,7 @@ from service.web.middleware import (
     SecurityHeadersMiddleware,
     StoppingMiddleware,
 )
+from service.web.resources import jobs
 from service.web.responses import openapi, problems
 from service.web.responses.job_events import Watchers
 from service.web.root.health import SharedCheck
@@ -83,12 +83,14 @@ def collect_routes(kinds: Kinds) -> list[BaseRoute]:
     v1.include_router(
         jobs.creators(kinds)
     )  # before the routes of a job, which would read the names of kinds as numbers
-    resources = [one for one in modules_of("service.web.resources") if hasattr(one, "router")]
-    for resource in (*modules_of("service.web.api"), *resources):
-        v1.include_router(resource.router)
+    resources = modules_of("service.web.resources")
+    for resource in resources:
+        if hasattr(resource, "router"):
+            v1.include_router(resource.router)
     root.include_router(v1)
     for resource in resources:
-        root.include_router(resource.pages)
+        if hasattr(resource, "pages"):
+            root.include_router(resource.pages)
     for place in (*modules_of("service.web.root"), *modules_of("service.web.pages")):
         if hasattr(place, "router"):
             root.include_router(place.router)

@@ -22,7 +22,7 @@ app = typer.Typer(
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
     """List all versions, oldest first; the current one is the newest that is not withdrawn."""
-    from service.web.api.models import all_models, declared_model
+    from service.web.resources.models import all_models, declared_model
 
     with reading() as session:
         versions = (

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from sqlalchemy import ColumnElement, Select, Text, cast, select
+from sqlalchemy import ColumnElement, Select, Text, cast, func, select
 from sqlalchemy.orm import Session, undefer
 
 from service.base import names
@@ -173,6 +173,16 @@ def list_measurements(
             query = query.where(column.is_not(None) if is_known else column.is_(None))
     last = None if after is None else get_measurement(session, heliostat, after).id
     return session.scalars(select_after(session, query, MeasurementRow, order, last)).all()
+
+
+def count_undated(session: Session) -> list[tuple[str, int]]:
+    """Heliostats with photographs of unknown time, and how many, the most first."""
+    row = MeasurementRow
+    n = func.count(func.distinct(func.coalesce(row.external_id, row.identifier)))
+    query = select(HeliostatRow.name, n).join(HeliostatRow, HeliostatRow.id == row.heliostat_id)
+    query = query.where(row.taken_at.is_(None)).group_by(HeliostatRow.name)
+    found = session.execute(query.order_by(n.desc(), HeliostatRow.name)).all()
+    return [(name, count) for name, count in found]
 
 
 def has_warning(type_: str) -> ColumnElement[bool]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session, defer
 
 from model.locating import locator_from_json, locator_to_json
@@ -14,7 +14,7 @@ from service.base.fields import JsonObject
 from service.base.plant_facts import PlantFacts
 from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json, rectangle
 from service.store.rows import Change, Put, assign, floats, insert, insert_or_find
-from service.store.tables import HeliostatRow, PlantRow, ReceiverRow, TargetRow
+from service.store.tables import HeliostatRow, MeasurementRow, PlantRow, ReceiverRow, TargetRow
 
 _NEW_PLANT = "heliotwin.new_plant"
 
@@ -197,6 +197,16 @@ def get_target(session: Session, name: str) -> TargetRow:
 def list_targets(session: Session) -> Sequence[TargetRow]:
     """All targets, sorted by name."""
     return session.scalars(select(TargetRow).order_by(TargetRow.name)).all()
+
+
+def count_photographs(session: Session) -> list[tuple[TargetRow, int]]:
+    """All targets, sorted by name, with the number of their images."""
+    counted = (
+        select(TargetRow, func.count(MeasurementRow.id))
+        .outerjoin(MeasurementRow)
+        .group_by(TargetRow.id)
+    )
+    return [(row, count) for row, count in session.execute(counted.order_by(TargetRow.name))]
 
 
 def put_target(

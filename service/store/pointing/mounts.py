@@ -1,6 +1,6 @@
 """Storage of calibrated mounts by version."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -58,6 +58,16 @@ def list_mounts(
         .options(undefer(MountRow.document))
     )
     return session.scalars(query.where(MountRow.version > after) if after else query).all()
+
+
+def mounts_of_versions(session: Session, versions: Mapping[str, int]) -> dict[str, MountRow]:
+    """The stored ones of some mounts, by heliostat; ``versions`` says which."""
+    rows = session.execute(
+        select(HeliostatRow.name, MountRow)
+        .join(MountRow, MountRow.heliostat_id == HeliostatRow.id)
+        .where(HeliostatRow.name.in_(versions))
+    )
+    return {name: mount for name, mount in rows if mount.version == versions[name]}
 
 
 def find_mount_at(

@@ -236,6 +236,12 @@ def list_decisions(
     return session.scalars(select_after(session, query, DecisionRow, NEWEST_FIRST, after)).all()
 
 
+def is_undecided(session: Session, candidate: SurfaceRow) -> bool:
+    """Whether nobody decided on a candidate after the decision with which it was stored."""
+    query = select(DecisionRow.id).where(DecisionRow.surface_id == candidate.id).limit(2)
+    return len(session.scalars(query).all()) < 2
+
+
 def find_comparison(
     session: Session, surface: SurfaceRow, other: SurfaceRow | None
 ) -> Justification | None:

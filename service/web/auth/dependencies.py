@@ -18,6 +18,7 @@ from service.base.errors import UnsupportedContentError
 from service.base.fields import MeasurementName, Name, Reason
 from service.jobs.kind import Kinds
 from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant.setup import Authorship
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import ComparisonCache
@@ -32,6 +33,15 @@ async def get_runtime(request: Request) -> Runtime:
 
 
 RuntimeDep = Annotated[Runtime, Depends(get_runtime)]
+
+
+def _zone(runtime: RuntimeDep) -> str:
+    with runtime.database.reading() as session:
+        return plant_time_zone(session, runtime.settings.time_zone)
+
+
+ZoneDep = Annotated[str, Depends(_zone)]
+"""The plant's time zone, which the times of forms are in."""
 
 
 async def _field(request: Request) -> FieldOverviewCache:

@@ -9,11 +9,15 @@ from pydantic import BaseModel, StringConstraints, ValidationError
 from model.errors import InvalidInputError
 from service.base.fields import Lines
 from service.jobs.kinds import KINDS
-from service.web.api.corrections import CorrectionIn
-from service.web.api.times import TimesIn, patch_times
 from service.web.auth.dependencies import COMPUTE_SLOT, OPERATE, IdentityDep, RuntimeDep
-from service.web.pages.decisions import ExclusionForm, post_exclusion_form
 from service.web.resources.alarms import AcknowledgementsIn, post_acknowledgements
+from service.web.resources.corrections import (
+    CorrectionIn,
+    ExclusionForm,
+    TimesIn,
+    patch_times,
+    post_exclusion_form,
+)
 from service.web.resources.studies import AdoptIn, WithdrawIn, adopt_study, withdraw_study
 from service.web.responses.pages import go_to, go_to_job
 

@@ -61,13 +61,12 @@ from service.web.auth.dependencies import (
 from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.openapi import problems
 from service.web.responses.pages import count_badge, go_to, render
-from service.web.responses.paging import Page, page
+from service.web.responses.paging import AfterId, Page, page
 
 router = APIRouter(prefix="/alarms", tags=["alarms"])
 pages = APIRouter(include_in_schema=False)
 
 Number = Annotated[Version, Path(description="Number of the acknowledgement.")]
-After = Annotated[Version | None, Query(description="The last id of the page before.")]
 
 # Alarms that the page lists of one reason, or in total if it is sorted otherwise.
 _LISTED = 100
@@ -197,7 +196,7 @@ class HistoryQuery(Model):
     reason: Reason | None = Field(default=None, description="Only this reason.")
     heliostat: Name | None = Field(default=None, description="Only this heliostat.")
     limit: Limit = 100
-    after: After = None
+    after: AfterId = None
 
 
 class HistoryForm(HistoryQuery):
@@ -254,6 +253,19 @@ async def _count(request: Request) -> AlarmCount:
 AlarmCountDep = Annotated[AlarmCount, Depends(_count)]
 
 
+def stored_alarms(runtime: Runtime) -> AlarmList:
+    """All alarms, acknowledged or not."""
+    with runtime.database.reading() as session:
+        return read_alarms(session)
+
+
+def count_again(runtime: RuntimeDep, count: AlarmCountDep) -> AlarmCount:
+    """The numbers of open alarms, counted again."""
+    with runtime.database.reading() as session:
+        count.read(session)
+    return count
+
+
 class ChosenAlarms(NamedTuple):
     """All alarms that were ``found``, and those of a page's query with their causes and groups."""
 
@@ -304,8 +316,7 @@ def _acknowledgements(
 @router.get("", responses=problems(), dependencies=[READ, OVERVIEW_SLOT])
 def list_alarms(query: Annotated[AlarmListQuery, Query()], runtime: RuntimeDep) -> AlarmPage:
     """List alarms, in the order of ids. The thresholds are those of the current settings."""
-    with runtime.database.reading() as session:
-        found = read_alarms(session)
+    found = stored_alarms(runtime)
     after = query.after or ""
     wanted = [alarm for alarm in query.choose(found.alarms) if alarm.id > after]
     part = page(sorted(wanted, key=attrgetter("id")), query.limit)
@@ -324,17 +335,14 @@ def get_alarms_page(
 @pages.get("/alarms.csv", dependencies=[READ, RENDER_SLOT])
 def get_alarms_table(runtime: RuntimeDep) -> Response:
     """All alarms, acknowledged or not."""
-    with runtime.database.reading() as session:
-        alarms = read_alarms(session).alarms
+    alarms = stored_alarms(runtime).alarms
     rows = ([getattr(alarm, name) for name in _COLUMNS] for alarm in alarms)
     return sheet_answer("alarms", _COLUMNS, rows)
 
 
 @pages.get("/alarms/count", dependencies=[READ])
-def get_alarm_count(runtime: RuntimeDep, count: AlarmCountDep) -> Response:
+def get_alarm_count(count: Annotated[AlarmCount, Depends(count_again)]) -> Response:
     """The number of alarms that are not acknowledged, for the menu."""
-    with runtime.database.reading() as session:
-        count.read(session)
     return HTMLResponse(count_badge(count.last))
 
 
@@ -362,8 +370,7 @@ def post_acknowledgements(
     An acknowledgement lasts until the reason of the alarm changes or returns, or until it is
     undone. The first one is kept.
     """
-    with runtime.database.reading() as session:
-        found = read_alarms(session)
+    found = stored_alarms(runtime)
     items = acknowledge(runtime, found, seen.ids, identity.name, seen.reason)
     return Page(items=items, next=None)
 
@@ -392,7 +399,7 @@ def post_acknowledgement_form(
 
 @router.get("/acknowledgements", responses=problems(), dependencies=[READ])
 def list_acknowledgements(
-    runtime: RuntimeDep, limit: Limit = 100, after: After = None
+    runtime: RuntimeDep, limit: Limit = 100, after: AfterId = None
 ) -> Page[AcknowledgementOut]:
     """List acknowledgements, newest first, also those that were undone."""
     return page(_acknowledgements(runtime, limit + 1, after), limit)

@@ -48,7 +48,6 @@ from service.drawing.study_report import VERDICTS, report_page
 from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
-from service.store.listing import Order, Period
 from service.store.tables import PlantRow, StudyRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant import model_versions
@@ -67,20 +66,19 @@ from service.twin.studies.field_change import (
 )
 from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.twin.studies.study import MAX_STUDY_IMAGES, StudyIn, Surfaces, extent_of
-from service.web.api.models import ModelOut, current_out, model_out
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
     READ,
     RENDER_SLOT,
     IdentityDep,
-    Limit,
     RuntimeDep,
 )
+from service.web.resources.models import ModelOut, current_out, model_out
 from service.web.resources.study_charts import study_timelines
 from service.web.responses.openapi import TEXT, problems
 from service.web.responses.pages import go_to, go_to_job, render
-from service.web.responses.paging import OrderQuery, Page, Since, Until, page
+from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 
 router = APIRouter(tags=["studies"])
 pages = APIRouter(include_in_schema=False)
@@ -319,6 +317,34 @@ def model_history(runtime: Runtime) -> dict[str, object]:
         }
 
 
+def outdated_surfaces(runtime: Runtime) -> list[store.Outdated]:
+    """Active surfaces that another version of the model made."""
+    with runtime.database.reading() as session:
+        return store.outdated_surfaces(session, model_versions.current_version(session))
+
+
+def body_of_form(runtime: Runtime, form: NewStudyForm) -> StudyIn:
+    """The body of REST that a form means."""
+    with runtime.database.reading() as session:
+        return form.body(session, plant_time_zone(session, runtime.settings.time_zone))
+
+
+def new_study_figures(runtime: Runtime, form: NewStudyForm) -> dict[str, object]:
+    """What a study would use, and its expected duration."""
+    body = body_of_form(runtime, form)
+    with runtime.database.reading() as session:
+        extent = extent_of(session, body)
+        cost = study_cost(session, extent.n_photographs, body.candidates)
+    return {
+        "effects": {name: kind.about.partition(": ")[2] for name, kind in CATALOGUE.items()},
+        "extent": extent,
+        "cost": cost,
+        "n_effects": len(body.candidates or CATALOGUE),
+        "least": MIN_IMAGES,
+        "most": MAX_STUDY_IMAGES,
+    }
+
+
 def _report(runtime: Runtime, number: int, crumbs: str) -> HTMLResponse:
     with runtime.database.reading() as session:
         row = store.get_study(session, number, page=True)
@@ -331,23 +357,28 @@ def _report(runtime: Runtime, number: int, crumbs: str) -> HTMLResponse:
 # --- lists and studies
 
 
+class StudiesQuery(ListQuery):
+    """Which studies are listed, newest first by default."""
+
+    verdict: Annotated[Verdict | None, Query(description="Only those of this verdict.")] = None
+    order: OrderQuery = "down"
+
+
 @router.get("/studies", responses=problems(), dependencies=[READ])
 def list_studies(
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
-    verdict: Annotated[Verdict | None, Query(description="Only those of this verdict.")] = None,
-    since: Since = None,
-    until: Until = None,
-    order: OrderQuery = "down",
+    query: Annotated[StudiesQuery, Query()], runtime: RuntimeDep
 ) -> Page[StudySummary]:
     """List studies, newest first."""
     with runtime.database.reading() as session:
-        made, direction = Period(since, until), Order(descending=order == "down")
         rows = store.list_studies(
-            session, limit + 1, after, verdict=verdict, created=made, order=direction
+            session,
+            query.limit + 1,
+            query.after,
+            verdict=query.verdict,
+            created=query.created,
+            order=query.by_id,
         )
-        return page(_summaries(session, rows), limit)
+        return page(_summaries(session, rows), query.limit)
 
 
 @pages.get("/studies", dependencies=[READ])
@@ -368,20 +399,7 @@ def get_new_study_page(
     request: Request, form: Annotated[NewStudyForm, Query()], runtime: RuntimeDep
 ) -> HTMLResponse:
     """The form, with the photographs that a study would use and its expected duration."""
-    with runtime.database.reading() as session:
-        body = form.body(session, plant_time_zone(session, runtime.settings.time_zone))
-        extent = extent_of(session, body)
-        return render(
-            request,
-            "new_study.html",
-            form=form,
-            effects={name: kind.about.partition(": ")[2] for name, kind in CATALOGUE.items()},
-            extent=extent,
-            cost=study_cost(session, extent.n_photographs, body.candidates),
-            n_effects=len(body.candidates or CATALOGUE),
-            least=MIN_IMAGES,
-            most=MAX_STUDY_IMAGES,
-        )
+    return render(request, "new_study.html", form=form, **new_study_figures(runtime, form))
 
 
 @pages.post("/studies", dependencies=[OPERATE])
@@ -389,9 +407,7 @@ def post_study_form(
     form: Annotated[NewStudyForm, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Enqueue the study, and go to the page of the job."""
-    with runtime.database.reading() as session:
-        body = form.body(session, plant_time_zone(session, runtime.settings.time_zone))
-    return go_to_job(runtime, KINDS["studies"], body, identity)
+    return go_to_job(runtime, KINDS["studies"], body_of_form(runtime, form), identity)
 
 
 @router.get(
@@ -563,9 +579,7 @@ def post_predict_again_form(
 
     Go to the page of the job.
     """
-    with runtime.database.reading() as session:
-        outdated = store.outdated_surfaces(session, model_versions.current_version(session))
-    names = [surface.heliostat for surface in outdated if not surface.waits]
+    names = [surface.heliostat for surface in outdated_surfaces(runtime) if not surface.waits]
     if not names:
         raise ConflictError(
             "all surfaces were made by the current model, or one that was waits aside"

@@ -53,6 +53,11 @@ class JobSummary(BaseModel):
     finished_at: datetime | None = Field(description="When it ended; null: it has not.")
     href: str = Field(description="Path of the whole job, with its payload and its result.")
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether it is done, failed or cancelled."""
+        return self.state in queue.ENDED
+
 
 def job_summary(row: JobRow) -> JobSummary:
     """Summarize a job."""

@@ -27,7 +27,7 @@ from service.twin.alarms.field_overview import (
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
-from service.web.pages.field_page import FieldView
+from service.web.resources.field import FieldView
 from tests.page import Page
 from tests.service.conftest import (
     QUIET,

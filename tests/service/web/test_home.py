@@ -17,7 +17,7 @@ from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.field_state import FieldAccuracy, field_accuracy
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
-from service.web.pages.field_page import STEPS
+from service.web.resources.field import STEPS
 from tests.service.conftest import (
     ORIGIN,
     QUIET,

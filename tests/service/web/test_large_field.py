@@ -170,7 +170,7 @@ def test_results_of_a_large_field_are_reused_for_a_while(
     app: FastAPI = large.app  # type: ignore[assignment]
     monkeypatch.setattr(app.state.field, "_recent", RecentResults(600.0))
     monkeypatch.setattr(
-        "service.web.api.field_overview.filter_heliostats",
+        "service.web.resources.field.filter_heliostats",
         lambda lines, wanted: (computed.append("field"), lines)[1],
     )
     for path in ("/v1/field", "/v1/field?limit=2"):

@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 
 from model.ephemeris import sun_angles_at
 from service.base.fields import parse_moment
-from service.web.pages.photograph_upload import time_in_name
+from service.web.resources.photographs import time_in_name
 from tests.page import Page
 from tests.service.conftest import ORIGIN, png
 from tests.service.web.pages import HTML, make_key, text_of

@@ -35,7 +35,7 @@ from service.store.photographs.groups import (
 from service.store.tables import TargetRow
 from service.twin.runtime import runtime
 from service.web.app import create_app
-from service.web.pages import heliostat
+from service.web.resources import heliostats
 from service.web.resources import photographs as photograph_list
 from tests.page import Page
 from tests.service.conftest import (
@@ -113,7 +113,7 @@ def test_photographs_are_chosen_by_verdict(filled: TestClient, verdict: str, nam
 
 
 def test_older_photographs_are_a_page_away(filled: TestClient, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(heliostat, "MAX_PHOTOGRAPHS", 2)
+    monkeypatch.setattr(heliostats, "MAX_PHOTOGRAPHS", 2)
     page = text_of(filled, "/heliostats/AA39")
     assert rows_of(page) == ["3", "2"]
     (older,) = [link for link in page.links if re.search(r"^/photographs.*after=\d+$", link)]

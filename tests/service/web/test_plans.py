@@ -20,7 +20,7 @@ from service.store.columns import now
 from service.store.job_tables import JobRow, JobStepRow
 from service.store.jobs import queue
 from service.store.record_retention import prune_jobs, prune_plans
-from service.web.pages import plan
+from service.web.resources import plans
 from tests.page import Page
 from tests.service.conftest import FakeOperations
 from tests.service.web.pages import field_of, make_key, text_of, work
@@ -374,7 +374,7 @@ def listed(page: Page) -> list[str]:
 def test_all_plans_are_listed(
     app: FastAPI, two_heliostats: TestClient, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(plan, "LISTED", 2)
+    monkeypatch.setattr(plans, "LISTED", 2)
     for number in range(3):
         two_heliostats.post("/v1/jobs/plans", json=DAY | {"name": f"plan {number}"})
     page = text_of(two_heliostats, "/plans")

@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 
 from service.base.errors import SchemaError
 from service.base.settings import Settings
-from service.web.api.measurements import MeasurementIn
 from service.web.app import create_app
+from service.web.resources.measurements import MeasurementIn
 from tests.service.conftest import client_of, metadata
 from tests.service.web.problems import check
 

@@ -13,8 +13,8 @@ from service.drawing.charts import PlanePicture
 from service.drawing.timelines import Value, timeline
 from service.twin.alarms.field_filter import METRICS
 from service.twin.alarms.field_overview import HeliostatOverview
-from service.web.pages.field_page import ColourEnds, colour_ends, draw
-from service.web.pages.forecast import time_of
+from service.web.resources.field import ColourEnds, colour_ends, draw
+from service.web.resources.forecasts import time_of
 
 LIMITS = ColourEnds(95.0, 75.0)
 

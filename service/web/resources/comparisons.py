@@ -1,4 +1,4 @@
-"""Page that compares two surfaces of one heliostat or two.
+"""Comparison of two surfaces of one heliostat or two.
 
 Maps share one scale. The page also shows the forecasts of both surfaces, and their history.
 """
@@ -14,7 +14,6 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import model_validator
-from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
@@ -39,9 +38,9 @@ from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline, Value
 from service.store.columns import EPOCH
-from service.store.listing import EVER, Period
+from service.store.listing import EVER, NEWEST_FIRST, Period
 from service.store.pointing import mounts
-from service.store.tables import HeliostatRow, MountRow, PlantRow, SurfaceRow, TargetRow
+from service.store.tables import HeliostatRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import trace_request
@@ -58,9 +57,8 @@ from service.web.auth.dependencies import (
     ComparisonCacheDep,
     RuntimeDep,
 )
-from service.web.pages.forecast import sun_now
-from service.web.pages.heliostat import newest_surfaces
-from service.web.pages.heliostat_charts import (
+from service.web.resources.forecasts import sun_now
+from service.web.resources.heliostat_figures import (
     OverTime,
     accuracy_over_time,
     accuracy_values,
@@ -69,9 +67,10 @@ from service.web.pages.heliostat_charts import (
     pointing_values,
     version_marks,
 )
+from service.web.resources.heliostats import MAX_SURFACES
 from service.web.responses.pages import render
 
-router = APIRouter(include_in_schema=False, dependencies=[READ])
+pages = APIRouter(include_in_schema=False)
 
 _RESOLUTION = (128, 128)
 
@@ -142,7 +141,9 @@ _MAX_MOUNTS = 40
 def _side(session: Session, name: str, version: int | None) -> Side:
     """Load a surface of a heliostat: this version, or the active one."""
     heliostat = store.get_heliostat(session, name)
-    versions = newest_surfaces(session, heliostat)
+    versions = store.list_surfaces(
+        session, heliostat, MAX_SURFACES, arrays=True, order=NEWEST_FIRST
+    )
     if version is None:
         surface = store.get_surface_at(session, heliostat)
     else:
@@ -168,16 +169,13 @@ def _sides(session: Session, query: CompareQuery) -> tuple[Side, Side]:
     second = _side(session, query.other or query.heliostat, query.other_version)
     if query.version is not None or second.heliostat.name != query.heliostat:
         return _side(session, query.heliostat, query.version), second
-    of_heliostat = select(func.max(SurfaceRow.version)).where(
-        SurfaceRow.heliostat_id == second.heliostat.id
-    )
-    before = session.scalar(of_heliostat.where(SurfaceRow.version < second.surface.version))
-    if before is not None:
-        return _side(session, query.heliostat, before), second
-    after = session.scalar(of_heliostat.where(SurfaceRow.version > second.surface.version))
-    if after is None:
-        raise NotFoundError(f"heliostat {query.heliostat} has one surface only")
-    return second, _side(session, query.heliostat, after)
+    of, version = second.heliostat, second.surface.version
+    for before in store.list_surfaces(session, of, 1, version, order=NEWEST_FIRST):
+        return _side(session, query.heliostat, before.version), second
+    for newest in store.list_surfaces(session, of, 1, order=NEWEST_FIRST):
+        if newest.version > version:
+            return second, _side(session, query.heliostat, newest.version)
+    raise NotFoundError(f"heliostat {query.heliostat} has one surface only")
 
 
 # --- maps
@@ -353,8 +351,8 @@ def _read(
     query: Annotated[CompareQuery, Query()], runtime: RuntimeDep, cache: ComparisonCacheDep
 ) -> _ComparisonData:
     with runtime.database.reading() as session:
-        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
-        sun = sun_now(session.get(PlantRow, 1))
+        targets = [row.name for row in store.list_targets(session)]
+        sun = sun_now(store.find_plant(session))
         zone = plant_time_zone(session, runtime.settings.time_zone)
         sides, alone = None, None
         if query.heliostat is not None:
@@ -381,7 +379,7 @@ def _read(
     return _ComparisonData(sides, epochs, alone, compared, targets, sun, zone)
 
 
-@router.get("/compare", dependencies=[RENDER_SLOT, COMPUTE_SLOT])
+@pages.get("/compare", dependencies=[READ, RENDER_SLOT, COMPUTE_SLOT])
 def get_compare_page(
     query: Annotated[CompareQuery, Query()],
     read: Annotated[_ComparisonData, Depends(_read)],

@@ -1,18 +1,28 @@
-"""The plant, its target planes and its receivers."""
+"""The plant: REST of its tower, target planes and receivers, and its page."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import NoneType
 from typing import Annotated, Literal, Self
 
-from fastapi import APIRouter, Depends, Response, status
+import numpy as np
+from fastapi import APIRouter, Depends, Form, Request, Response, status
+from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from model.frames import wgs84_to_enu
+from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.plant import Plant, TargetPlane
+from model.receivers import Cavity
 from service import store
-from service.base.fields import Model, Plane, TargetOf, Wgs84, from_row
+from service.base.fields import JsonObject, Model, Plane, TargetOf, Wgs84, from_row
 from service.base.plant_facts import TowerSize
 from service.base.receivers import KIND, ReceiverIn
+from service.drawing.templates import figure
+from service.jobs.kinds import measurements
+from service.jobs.kinds.measurements import MeasurementsIn
 from service.sources.documents import (
     describe_sun,
     parse_declared,
@@ -22,25 +32,29 @@ from service.sources.documents import (
     read_tower_base,
     unknown_parts,
 )
-from service.sources.plant_schema import CameraEntry, Marks
+from service.sources.plant_schema import CameraEntry, FacetGridEntry, HeliostatTypeEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store import audit
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.rows import Put
-from service.store.tables import ReceiverRow, TargetRow
+from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.photographs.camera_choice import read_camera_choice
 from service.twin.plant import setup
-from service.twin.plant.model_versions import get_model
+from service.twin.plant.model_versions import CameraAnswer, get_model
+from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
     AuthorshipDep,
+    IdentityDep,
     NamePath,
     RuntimeDep,
     require_json,
     set_tag,
 )
 from service.web.responses.openapi import problems
+from service.web.responses.pages import go_to_job, render
 from service.web.responses.paging import Page
 
 Place = tuple[float, float, float]
@@ -238,6 +252,7 @@ def receiver_out(row: ReceiverRow) -> ReceiverOut:
 _RECEIVER: TypeAdapter[ReceiverOut] = TypeAdapter(ReceiverOut)
 
 router = APIRouter(tags=["plant"])
+pages = APIRouter(include_in_schema=False)
 _CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
 
 
@@ -397,3 +412,99 @@ def delete_receiver(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> N
     This is refused if waiting jobs refer to it.
     """
     runtime.database.run_in_transaction(lambda session: setup.remove(session, by, "receiver", name))
+
+
+# --- the page
+# --------------------------------------------------------------------------------------------------
+
+_LOCATED_BY: Mapping[type, str] = {
+    NoneType: "L and T marks",
+    BracketMarks: "L brackets",
+    SheetEdges: "edges",
+    CameraCorners: "camera, by corners",
+    CameraHomography: "camera, by homography",
+    CameraPose: "camera, by pose",
+}
+"""What shows in photographs where a target is, by its locator; without one as at Juelich."""
+
+
+def _located_by(row: TargetRow) -> str:
+    return _LOCATED_BY[type(store.target_plane(row).locator)]
+
+
+_NO_SIZES: JsonObject = dict.fromkeys(("radius", "opening_deg", "panels", "aperture_m2"))
+
+
+def _surface(row: ReceiverRow) -> JsonObject:
+    """Sizes [m, m2] of a receiver and of a cavity's opening; those that it lacks are None."""
+    receiver = store.stored_receiver(row)
+    sizes = _NO_SIZES | receiver_as_json(receiver)
+    if isinstance(receiver, Cavity):
+        corners = receiver.aperture
+        parts = np.cross(corners, np.roll(corners, -1, axis=0))
+        sizes["aperture_m2"] = float(np.linalg.norm(parts.sum(axis=0)) / 2)
+    return sizes
+
+
+@dataclass(frozen=True)
+class TypeLine:
+    """A heliostat type of ``plant.yaml`` in the table, with its facets in words."""
+
+    name: str
+    entry: HeliostatTypeEntry
+    facets: str
+
+
+def _type_lines(plant: PlantRow | None) -> list[TypeLine]:
+    """Heliostat types that the plant's file declares."""
+    if plant is None or plant.heliostat_types is None:
+        return []
+    lines = []
+    for name, declared in plant.heliostat_types["types"].items():
+        entry = HeliostatTypeEntry.model_validate(declared)
+        facets = entry.facets
+        if isinstance(facets, FacetGridEntry):
+            size = f"{facets.width_m:g} × {facets.height_m:g} m"
+            text = f"{facets.rows * facets.columns} of {size}"
+        else:
+            text = f"as in {facets.file}"
+        lines.append(TypeLine(name, entry, text))
+    return lines
+
+
+def _place(metres: Sequence[float]) -> list[str]:
+    """East, north and up as parts of a table's cell."""
+    east, north, up = (figure(value, 2) for value in metres)
+    return [east, ", ", north, ", ", up]
+
+
+def plant_figures(runtime: Runtime) -> dict[str, object]:
+    """What the page of the plant shows."""
+    with runtime.database.reading() as session:
+        plant = store.find_plant(session)
+        model = None if plant is None else get_model(session)
+        return {
+            "plant": plant,
+            "targets": store.count_photographs(session),
+            "receivers": [(row, _surface(row)) for row in store.list_receivers(session)],
+            "types": _type_lines(plant),
+            "model": model,
+            "sun": None if model is None else describe_sun(model.optics.sun_shape),
+            "camera": None if plant is None else read_camera_choice(session),
+        }
+
+
+@pages.get("/plant", dependencies=[READ])
+def get_plant_page(request: Request, runtime: RuntimeDep) -> HTMLResponse:
+    """Targets and receivers on the tower, and the optical model."""
+    shown = plant_figures(runtime)
+    return render(request, "plant.html", **shown, place=_place, located_by=_located_by)
+
+
+@pages.post("/plant/camera", dependencies=[OPERATE])
+def post_camera_form(
+    camera: Annotated[CameraAnswer, Form()], runtime: RuntimeDep, identity: IdentityDep
+) -> Response:
+    """Begin the job that declares what images without background are, and measures them again."""
+    payload = MeasurementsIn(camera=camera, reason="their camera was declared")
+    return go_to_job(runtime, measurements.KIND, payload, identity)

@@ -8,11 +8,9 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Form, Header, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from sqlalchemy import select
 
-from model.errors import ModelError
 from service import store
-from service.base.errors import NotFoundError, ServiceError
+from service.base.errors import NotFoundError
 from service.base.fields import (
     AZIMUTH,
     ELEVATION,
@@ -23,13 +21,11 @@ from service.base.fields import (
     ReadVersion,
     Reason,
 )
-from service.drawing.charts import PlanePicture
 from service.drawing.pictures import photograph_picture
 from service.drawing.templates import in_words
 from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
 from service.store.photographs.measurements import EXCLUDED, images_of_photograph
-from service.store.tables import CorrectionRow, MeasurementRow, TargetRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.store.tables import CorrectionRow, MeasurementRow
 from service.twin.heliostats.metadata import stored_metadata
 from service.twin.photographs.corrections import (
     GivenCorrection,
@@ -37,10 +33,8 @@ from service.twin.photographs.corrections import (
     correct_photograph,
 )
 from service.twin.photographs.deletion import delete_photograph
-from service.twin.photographs.display import compare_one, load_for_display, pixels_of
+from service.twin.photographs.display import load_for_display, pixels_of
 from service.twin.runtime.runtime import Runtime
-from service.web.api.corrections import predict_again
-from service.web.api.measurements import get_row, require_image
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -50,12 +44,15 @@ from service.web.auth.dependencies import (
     MeasurementPath,
     NamePath,
     RuntimeDep,
+    ZoneDep,
 )
-from service.web.pages.heliostat import comparison_figures
+from service.web.resources.corrections import predict_again
+from service.web.resources.heliostat_figures import forecast_figures
+from service.web.resources.measurements import get_row, require_image
 from service.web.responses.files import etag_matches
 from service.web.responses.pages import go_to, render
 
-router = APIRouter(include_in_schema=False)
+pages = APIRouter(include_in_schema=False)
 
 PATH = "/heliostats/{name}/photographs/{measurement}"
 
@@ -165,7 +162,7 @@ _VIEWS: dict[str, Callable[[Runtime, str, MeasurementRow], bytes]] = {
 }
 
 
-@router.get(PATH + "/{view}.jpg", dependencies=[READ, RENDER_SLOT])
+@pages.get(PATH + "/{view}.jpg", dependencies=[READ, RENDER_SLOT])
 def get_view(
     name: NamePath,
     measurement: MeasurementPath,
@@ -190,7 +187,29 @@ def get_view(
     return Response(_VIEWS[view](runtime, name, row), media_type="image/jpeg", headers=headers)
 
 
-@router.get(PATH, dependencies=[READ, COMPUTE_SLOT])
+def photograph_figures(runtime: Runtime, name: str, measurement: str) -> dict[str, object]:
+    """What the page of a photograph shows."""
+    with runtime.database.reading() as session:
+        version = newest_correction(session)
+        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
+        images = images_of_photograph(session, row)
+        corrections, made = list_corrections(session, row), made_from(session, row)
+        targets = [target.name for target in store.list_targets(session)]
+    is_measured = row.accepted and row.image_sha256 is not None
+    return {
+        "version": version,
+        "row": row,
+        "images": images,
+        "kept": {kind: image for kind, image in images.items() if image.has_file},
+        "is_excluded": row.reason == EXCLUDED,
+        "corrections": [(correction, change_texts(correction)) for correction in corrections],
+        "made": made,
+        "targets": targets,
+        **forecast_figures(runtime, name, row if is_measured else None),
+    }
+
+
+@pages.get(PATH, dependencies=[READ, COMPUTE_SLOT])
 def get_photograph_page(
     name: NamePath,
     measurement: MeasurementPath,
@@ -199,55 +218,35 @@ def get_photograph_page(
     unchanged: Annotated[bool, Query(description="Say that a correction changed nothing.")] = False,
 ) -> HTMLResponse:
     """A photograph with its flux, the forecast of the current twin, and its history."""
+    shown = photograph_figures(runtime, name, measurement)
+    return render(request, "photograph.html", name=name, unchanged=unchanged, **shown)
+
+
+def correction_of_form(
+    runtime: Runtime, name: str, measurement: str, form: CorrectionForm, zone: str
+) -> GivenCorrection:
+    """What the form changes of a photograph, compared with what its user saw."""
     with runtime.database.reading() as session:
-        version = newest_correction(session)
         row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-        images = images_of_photograph(session, row)
-        corrections, made = list_corrections(session, row), made_from(session, row)
-        targets = session.scalars(select(TargetRow.name).order_by(TargetRow.name)).all()
-    compared, trouble = [], None
-    if row.accepted and row.image_sha256 is not None:
-        try:
-            compared = [compare_one(runtime, name, measurement)]
-        except (ModelError, ServiceError) as error:
-            trouble = str(error)
-    return render(
-        request,
-        "photograph.html",
-        name=name,
-        version=version,
-        row=row,
-        images=images,
-        kept={kind: image for kind, image in images.items() if image.has_file},
-        comparisons=comparison_figures(compared, runtime.settings.figure_scales["flux_difference"]),
-        trouble=trouble,
-        plane_picture=PlanePicture,
-        unchanged=unchanged,
-        is_excluded=row.reason == EXCLUDED,
-        corrections=[(row, change_texts(row)) for row in corrections],
-        made=made,
-        targets=targets,
-    )
+        since = [] if form.version is None else list_corrections(session, row, form.version)
+        session.refresh(row)
+        return form.in_utc(zone).correction(name, row, since)
 
 
-@router.post(PATH, dependencies=[OPERATE, COMPUTE_SLOT])
+@pages.post(PATH, dependencies=[OPERATE, COMPUTE_SLOT])
 def post_correction_form(
     name: NamePath,
     measurement: MeasurementPath,
     form: Annotated[CorrectionForm, Form()],
     runtime: RuntimeDep,
     identity: IdentityDep,
+    zone: ZoneDep,
 ) -> Response:
     """Correct or exclude a photograph. Without a change, its page says so.
 
     Return to its page, or to the job that predicts the surface again.
     """
-    with runtime.database.reading() as session:
-        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
-        row = store.get_measurement(session, store.get_heliostat(session, name), measurement)
-        since = [] if form.version is None else list_corrections(session, row, form.version)
-        session.refresh(row)
-        given = form.correction(name, row, since)
+    given = correction_of_form(runtime, name, measurement, form, zone)
     try:
         correct_photograph(runtime, given, identity.name, form.version)
     except NothingToChangeError:
@@ -257,7 +256,7 @@ def post_correction_form(
     return go_to(f"/heliostats/{name}/photographs/{measurement}")
 
 
-@router.post(PATH + "/delete", dependencies=[OPERATE])
+@pages.post(PATH + "/delete", dependencies=[OPERATE])
 def post_deletion_form(
     name: NamePath,
     measurement: MeasurementPath,

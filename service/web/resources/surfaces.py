@@ -1,10 +1,11 @@
-"""Surfaces by version."""
+"""Surfaces by version, which of them is active, and the forms that decide."""
 
+from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Body, Depends, Path, Query, Response, status
+from fastapi import APIRouter, Body, Depends, Form, Path, Query, Response, status
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
@@ -21,10 +22,12 @@ from service.base.fields import (
     ModelNumber,
     ModelVersion,
     Moment,
+    ReadVersion,
     Reason,
     Source,
     SurfaceSource,
     SurfaceVersion,
+    Text,
     Version,
     VersionIn,
     Whole,
@@ -37,6 +40,7 @@ from service.store.surfaces import decisions
 from service.store.surfaces.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
+from service.twin.alarms.field_overview import field_totals
 from service.twin.heliostats.facets import facet_places
 from service.twin.runtime.runtime import Runtime
 from service.twin.surfaces.evaluation import justify_by_hand
@@ -46,6 +50,7 @@ from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
     READ,
+    RENDER_SLOT,
     IdentityDep,
     IfMatch,
     Limit,
@@ -55,9 +60,11 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
+from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
-from service.web.responses.paging import OrderQuery, Page, page
+from service.web.responses.pages import go_to
+from service.web.responses.paging import AfterId, OrderQuery, Page, page
 from service.web.responses.representation import Maps
 
 
@@ -240,6 +247,9 @@ def surface_answer(
 
 
 router = APIRouter(prefix="/heliostats/{name}/surfaces", tags=["surfaces"])
+pages = APIRouter(include_in_schema=False)
+
+VersionPath = Annotated[Version, Path(description="Number of the version, from 1.")]
 
 
 @router.post(
@@ -381,10 +391,21 @@ def put_current_surface(
     Both are compared on photographs that neither has seen. Versions with precedence over it become
     candidates.
     """
+    return _decide(runtime, name, choice, identity.name, active)
+
+
+def _decide(
+    runtime: Runtime,
+    name: str,
+    choice: ChoiceIn,
+    actor: str,
+    active: int | None,
+    became_active: bool = True,
+) -> DecisionOut:
     grounds = justify_by_hand(runtime, name, choice.version, choice.reason)
     return runtime.database.run_in_transaction(
         lambda session: decision_out(
-            decisions.decide(session, name, choice.version, True, identity.name, grounds, active)
+            decisions.decide(session, name, choice.version, became_active, actor, grounds, active)
         )
     )
 
@@ -397,22 +418,20 @@ def undo_decision(
 
     If-Match names the surface that was active, so that only one of two simultaneous undos succeeds.
     """
+    return _undo(runtime, name, identity.name, shown=active)
 
+
+def _undo(runtime: Runtime, name: str, actor: str, **expected: int | None) -> DecisionOut:
     def undo(session: Session) -> DecisionOut:
         heliostat = store.get_heliostat(session, name)
-        return decision_out(
-            decisions.undo_decision(session, heliostat, identity.name, shown=active)
-        )
+        return decision_out(decisions.undo_decision(session, heliostat, actor, **expected))
 
     return runtime.database.run_in_transaction(undo)
 
 
 @router.get("/decisions", responses=problems(404), dependencies=[READ])
 def list_decisions(
-    name: NamePath,
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
+    name: NamePath, runtime: RuntimeDep, limit: Limit = 100, after: AfterId = None
 ) -> Page[DecisionOut]:
     """List the decisions about the active surface, newest first."""
     with runtime.database.reading() as session:
@@ -428,10 +447,7 @@ def list_decisions(
     dependencies=[READ],
 )
 def get_surface(
-    name: NamePath,
-    version: Annotated[Version, Path(description="Number of the version, from 1.")],
-    runtime: RuntimeDep,
-    media_type: MediaType,
+    name: NamePath, version: VersionPath, runtime: RuntimeDep, media_type: MediaType
 ) -> Response:
     """Get a version of the surface."""
     with runtime.database.reading() as session:
@@ -447,7 +463,7 @@ def get_surface(
 )
 def acknowledge_surface(
     name: NamePath,
-    version: Annotated[Version, Path(description="Number of the version, from 1.")],
+    version: VersionPath,
     runtime: RuntimeDep,
     identity: IdentityDep,
     body: Annotated[SurfaceAcknowledgementIn, Body()],
@@ -461,3 +477,119 @@ def acknowledge_surface(
     with runtime.database.reading() as session:
         row = store.get_surface(session, store.get_heliostat(session, name), version)
         return surface_summary(name, row)
+
+
+# --- forms and the table
+# --------------------------------------------------------------------------------------------------
+
+
+class TakeForm(Model):
+    """The button, with an optional reason, and the version that was active; 0 for none."""
+
+    reason: Annotated[Text, Field(max_length=200)] = ""
+    active: ReadVersion = None
+
+
+@pages.post("/heliostats/{name}/surfaces/{version}/take", dependencies=[OPERATE])
+def post_take_form(
+    name: NamePath,
+    version: VersionPath,
+    form: Annotated[TakeForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Make a version the active surface."""
+    choice = ChoiceIn(version=version, reason=form.reason or f"{identity.name} chose it")
+    put_current_surface(name, runtime, identity, choice, form.active)
+    return go_to(f"/heliostats/{name}#history-title")
+
+
+@pages.post("/heliostats/{name}/surfaces/{version}/keep", dependencies=[OPERATE])
+def post_keep_form(
+    name: NamePath,
+    version: VersionPath,
+    form: Annotated[TakeForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Keep the active surface instead of a candidate."""
+    reason = form.reason or f"{identity.name} kept the active surface"
+    choice = ChoiceIn(version=version, reason=reason)
+    _decide(runtime, name, choice, identity.name, form.active, became_active=False)
+    return go_to(f"/heliostats/{name}#history-title")
+
+
+class DecisionUndoForm(Model):
+    """The button that undoes a decision; without its number, the last one."""
+
+    decision: ReadVersion = None
+
+
+@pages.post("/heliostats/{name}/surfaces/undo", dependencies=[OPERATE])
+def post_undo_form(
+    name: NamePath,
+    form: Annotated[DecisionUndoForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Undo the last decision."""
+    _undo(runtime, name, identity.name, decision=form.decision)
+    return go_to(f"/heliostats/{name}#history-title")
+
+
+@pages.post(
+    "/heliostats/{name}/surfaces/{version}/acknowledge", dependencies=[OPERATE, OVERVIEW_SLOT]
+)
+def post_acknowledge_form(
+    name: NamePath,
+    version: VersionPath,
+    form: Annotated[SurfaceAcknowledgementIn, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Acknowledge that a surface is not trusted, as its alarm."""
+    acknowledge_surface(name, version, runtime, identity, form)
+    return go_to(f"/heliostats/{name}#warnings-title")
+
+
+_SURFACE = (
+    "version",
+    "source",
+    "is_active",
+    "is_candidate",
+    "valid_from",
+    "created_at",
+    "deviation_mm",
+    "uncertainty_mm",
+    "misfit",
+    "trusted",
+    "warnings",
+    "photographs",
+    "model",
+    "model_version",
+)
+
+
+def surface_rows(runtime: Runtime, name: str) -> Iterator[list[object]]:
+    """All versions of a heliostat's surface as rows of CSV, oldest first."""
+    with runtime.database.reading() as session:
+        heliostat = store.get_heliostat(session, name)
+        today = store.find_surface_at(session, heliostat)
+        rows = store.list_surfaces(session, heliostat, None, arrays=True)
+    for row in rows:
+        figures = field_totals(row.arrays)
+        made = {
+            "is_active": today is not None and row.id == today.id,
+            "deviation_mm": figures.deviation_mm,
+            "uncertainty_mm": figures.uncertainty_mm,
+            "warnings": "; ".join(row.warnings or []),
+            "photographs": " ".join(one.identifier for one in row.measurements),
+            "model_version": row.model_version and int(row.model_version.partition(":")[0]),
+        }
+        yield [made[name] if name in made else getattr(row, name) for name in _SURFACE]
+
+
+@pages.get("/heliostats/{name}/surfaces.csv", dependencies=[READ, RENDER_SLOT])
+def get_surfaces_table(name: NamePath, runtime: RuntimeDep) -> Response:
+    """All versions of a heliostat's surface, oldest first."""
+    return sheet_answer(f"{name}-surfaces", _SURFACE, surface_rows(runtime, name))

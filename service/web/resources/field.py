@@ -1,24 +1,27 @@
-"""Page of the field: a map of all heliostats, coloured by a metric, and the same as a table."""
+"""The field: all heliostats by a metric, in REST, on a map, and as a table."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, ClassVar
 from urllib.parse import urlencode
 
 import numpy as np
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from service import store
-from service.base.fields import Search
+from service.base.errors import NotFoundError
+from service.base.fields import HeliostatOf, Name, Search, Source
 from service.drawing.charts import CONDITION, ColourScale
 from service.drawing.pictures import places_picture
 from service.drawing.templates import in_zone
-from service.store.tables import PlantRow
+from service.store.tables import HeliostatRow
+from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.field_filter import (
     CONDITIONS,
     METRICS,
@@ -27,15 +30,139 @@ from service.twin.alarms.field_filter import (
     default_order,
     filter_heliostats,
 )
-from service.twin.alarms.field_overview import HeliostatOverview
+from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
 from service.twin.alarms.reasons import SEVERITIES
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.web.auth.dependencies import READ, RENDER_SLOT, FieldCacheDep, RuntimeDep
+from service.twin.runtime.runtime import Runtime
+from service.web.auth.dependencies import (
+    OVERVIEW_SLOT,
+    READ,
+    RENDER_SLOT,
+    FieldCacheDep,
+    RuntimeDep,
+)
 from service.web.resources.alarms import AlarmCountDep
+from service.web.responses.csv_tables import sheet_answer
+from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
+from service.web.responses.paging import Page, page
 
-router = APIRouter(include_in_schema=False, dependencies=[READ])
+
+class FieldQuery(HeliostatFilter):
+    """Filter and order of heliostats, with paging."""
+
+    limit: int = Field(default=100, ge=1, le=500, description="Most items on a page.")
+    after: Name | None = Field(
+        default=None, description="The last name of the page before, of the same question."
+    )
+
+
+class FieldLine(BaseModel):
+    """A heliostat with its metrics. A value is null if it is unknown or not yet computed."""
+
+    name: HeliostatOf
+    position_m: tuple[float, float] = Field(description="East, north of the tower base [m].")
+    accuracy: float | None = Field(
+        description=(
+            "Mean flux accuracy of forecasts on photographs that the surface was not made from [1]."
+        )
+    )
+    judged_by: int | None = Field(description="How many photographs that is the mean of.")
+    deviation_mm: float | None = Field(
+        description="Root mean square of the heights over the ideal mirror [mm]."
+    )
+    uncertainty_mm: float | None = Field(
+        description="Root mean square of their standard deviations [mm]."
+    )
+    misfit: float | None = Field(
+        description="What the surface leaves unexplained of its photographs [1]."
+    )
+    age_days: float | None = Field(description="Of the surface [days].")
+    pointing_error_mrad: float | None = Field(
+        description="How far off light lands by the calibrated mount [mrad]."
+    )
+    sun_span_deg: float | None = Field(
+        description=(
+            "Largest angle between the suns of the photographs that the surface was made from"
+            " [deg]."
+        )
+    )
+    surface_version: int | None = Field(description="Version of the active surface.")
+    source: Source | None = Field(description="How that was obtained.")
+    trusted: bool | None = Field(
+        description="Null for what is measured, or before surfaces were judged."
+    )
+    warnings: list[str] = Field(description="Why it is not trusted.")
+    warned_since: datetime | None = Field(description="When its warnings began.")
+    acknowledged_by: str | None = Field(description="Who has seen the warnings.")
+    photographs: int = Field(description="How many photographs are stored.")
+    refused: int = Field(description="How many of them were refused.")
+
+
+def field_line(line: HeliostatOverview) -> FieldLine:
+    """A heliostat as JSON."""
+    surface = line.surface
+    return FieldLine.model_validate(
+        {
+            "name": line.name,
+            "position_m": (line.east_m, line.north_m),
+            **{name: metric.value(line) for name, metric in METRICS.items()},
+            "age_days": (
+                None if surface is None or surface.age_days is None else round(surface.age_days, 1)
+            ),
+            "judged_by": None if line.rank is None else line.rank.photographs,
+            "surface_version": None if surface is None else surface.version,
+            "source": None if surface is None else surface.source,
+            "trusted": None if surface is None else surface.trusted,
+            "warnings": [] if surface is None else surface.warnings or [],
+            "warned_since": None if surface is None else surface.warned_since,
+            "acknowledged_by": None if surface is None else surface.acknowledged_by,
+            "photographs": line.photographs,
+            "refused": line.refused,
+        }
+    )
+
+
+router = APIRouter(tags=["heliostats"])
+pages = APIRouter(include_in_schema=False)
+
+
+@router.get("/field", responses=problems(404), dependencies=[READ, OVERVIEW_SLOT])
+def list_field(
+    query: Annotated[FieldQuery, Query()], runtime: RuntimeDep, cache: FieldCacheDep
+) -> Page[FieldLine]:
+    """List heliostats with their metrics. They match the filter, in the order of one metric."""
+    with runtime.database.reading() as session:
+        per_unit, given = (
+            METRICS[query.metric].per_unit,
+            query.model_dump(exclude={"limit", "after"}),
+        )
+        limits = {
+            name: given[name] * per_unit for name in ("low", "high") if given[name] is not None
+        }
+        wanted = HeliostatFilter.model_validate(given | limits)
+        lines = cache.recent(
+            session,
+            wanted,
+            lambda: filter_heliostats(cache.read(session, PATIENCE_S).lines, wanted),
+        )
+    begin = 0
+    if query.after is not None:
+        names = [line.name for line in lines]
+        if query.after not in names:
+            raise NotFoundError(
+                f"after: heliostat {query.after} is not among these any more; begin again"
+                " without it"
+            )
+        begin = names.index(query.after) + 1
+    return page(
+        [field_line(line) for line in lines[begin : begin + query.limit + 1]], query.limit, "name"
+    )
+
+
+# --- the map
+# --------------------------------------------------------------------------------------------------
 
 # Heliostats on a page of the table.
 _LISTED = 100
@@ -299,30 +426,20 @@ def _counts(lines: Sequence[HeliostatOverview]) -> dict[str, int]:
     }
 
 
-@router.get("/find")
-def get_found_heliostat(runtime: RuntimeDep, find: Annotated[Search, Query()] = "") -> Response:
-    """Go to the heliostat of this name, or to the list of those whose names contain it."""
-    name = find.strip()
+def find_heliostats(runtime: Runtime, name: str) -> Sequence[HeliostatRow]:
+    """The heliostat of this name, else up to two whose names contain it."""
     with runtime.database.reading() as session:
         found = store.list_heliostats(session, 2, search=name)
         exact = [row for row in store.list_heliostats(session, 1, prefix=name) if name]
-    exact = [row for row in exact if row.name.lower() == name.lower()] or [*found]
-    if len(exact) == 1:
-        return go_to(f"/heliostats/{exact[0].name}")
-    return go_to(FieldView().link(search=name or None))
+    return [row for row in exact if row.name.lower() == name.lower()] or found
 
 
-@router.get("/", dependencies=[RENDER_SLOT])
-def get_field(
-    request: Request,
-    runtime: RuntimeDep,
-    cache: FieldCacheDep,
-    count: AlarmCountDep,
-    view: Annotated[FieldView, Query()],
-) -> HTMLResponse:
-    """The state of the field, its map with the filtered heliostats emphasized, and their table."""
+def field_figures(
+    runtime: Runtime, cache: FieldOverviewCache, count: AlarmCount, view: FieldView
+) -> dict[str, object]:
+    """What the page of the field draws: its state, the map, and a page of the table."""
     with runtime.database.reading() as session:
-        now, plant = cache.read(session), session.get(PlantRow, 1)
+        now, plant = cache.read(session), store.find_plant(session)
         alarms = count.read(session)
         work = cache.recent(
             session, ("work", view.period), partial(recent_work, session, view.period)
@@ -335,38 +452,85 @@ def get_field(
     last = max(math.ceil(len(found) / _LISTED), 1)
     begin = (min(view.page, last) - 1) * _LISTED
     scale = scale_for(chosen, ends)
-    return render(
-        request,
-        "field.html",
-        plant=None if plant is None else plant.name,
-        in_zone=in_zone(zone),
-        alarms=alarms,
-        severities=SEVERITIES,
-        accuracy=field_accuracy(lines, limit),
-        limit=limit,
-        work=work,
-        periods=PERIODS,
-        lines=lines,
-        counts=_counts(lines),
-        found=len(found),
-        listed=found[begin : begin + _LISTED],
-        begin=begin,
-        page=min(view.page, last),
-        last=last,
-        view=view,
-        conditions=CONDITIONS,
-        metrics=METRICS,
-        metric=chosen,
-        scale=scale,
-        fine=limits[0],
-        poor=limits[1],
-        ends=ends,
-        steps=legend(ends.best, ends.worst),
-        field_map=FieldMap(found, chosen, scale),
-        drawing=draw(lines, found, chosen, ends) if lines else None,
-        pending=now.pending,
-        is_behind=now.is_behind,
+    return {
+        "plant": None if plant is None else plant.name,
+        "in_zone": in_zone(zone),
+        "alarms": alarms,
+        "severities": SEVERITIES,
+        "accuracy": field_accuracy(lines, limit),
+        "limit": limit,
+        "work": work,
+        "periods": PERIODS,
+        "lines": lines,
+        "counts": _counts(lines),
+        "found": len(found),
+        "listed": found[begin : begin + _LISTED],
+        "begin": begin,
+        "page": min(view.page, last),
+        "last": last,
+        "view": view,
+        "conditions": CONDITIONS,
+        "metrics": METRICS,
+        "metric": chosen,
+        "scale": scale,
+        "fine": limits[0],
+        "poor": limits[1],
+        "ends": ends,
+        "steps": legend(ends.best, ends.worst),
+        "field_map": FieldMap(found, chosen, scale),
+        "drawing": draw(lines, found, chosen, ends) if lines else None,
+        "pending": now.pending,
+        "is_behind": now.is_behind,
         # The computation for a large field takes time, and its page is long. Reload less often the
         # more heliostats are pending.
-        again_ms=min(max(1500, 30 * now.pending), 15_000) if now.pending or now.is_behind else None,
+        "again_ms": min(max(1500, 30 * now.pending), 15_000)
+        if now.pending or now.is_behind
+        else None,
+    }
+
+
+# --- pages
+# --------------------------------------------------------------------------------------------------
+
+
+@pages.get("/find", dependencies=[READ])
+def get_found_heliostat(runtime: RuntimeDep, find: Annotated[Search, Query()] = "") -> Response:
+    """Go to the heliostat of this name, or to the list of those whose names contain it."""
+    name = find.strip()
+    found = find_heliostats(runtime, name)
+    if len(found) == 1:
+        return go_to(f"/heliostats/{found[0].name}")
+    return go_to(FieldView().link(search=name or None))
+
+
+@pages.get("/", dependencies=[READ, RENDER_SLOT])
+def get_field(
+    request: Request,
+    runtime: RuntimeDep,
+    cache: FieldCacheDep,
+    count: AlarmCountDep,
+    view: Annotated[FieldView, Query()],
+) -> HTMLResponse:
+    """The state of the field, its map with the filtered heliostats emphasized, and their table."""
+    return render(request, "field.html", **field_figures(runtime, cache, count, view))
+
+
+_COLUMNS = [name for name in FieldLine.model_fields if name not in ("position_m", "warnings")]
+
+
+def _filtered(
+    filters: Annotated[HeliostatFilter, Query()], runtime: RuntimeDep, cache: FieldCacheDep
+) -> list[FieldLine]:
+    with runtime.database.reading() as session:
+        lines = filter_heliostats(cache.read(session, PATIENCE_S).lines, filters)
+    return [field_line(line) for line in lines]
+
+
+@pages.get("/field.csv", dependencies=[READ, RENDER_SLOT])
+def get_field_table(lines: Annotated[list[FieldLine], Depends(_filtered)]) -> Response:
+    """All heliostats of the filter, in its order."""
+    rows = (
+        [*line.position_m, *(getattr(line, name) for name in _COLUMNS), "; ".join(line.warnings)]
+        for line in lines
     )
+    return sheet_answer("field", ["east_m", "north_m", *_COLUMNS, "warnings"], rows)

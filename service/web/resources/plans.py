@@ -1,15 +1,15 @@
-"""Pages of plans: flux of the field on a receiver over a day.
+"""Plans: flux of the field on a receiver over a day, and the aims that keep its limit.
 
 A plan compares the twin with ideal mirrors, and with the flux that the receiver allows.
 """
 
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime, time, timedelta
 from typing import Annotated
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from fastapi import APIRouter, Form, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Form, Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
 from pydantic import Field, ValidationError
@@ -18,29 +18,36 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from service import store
 from service.base.arrays import unpack
-from service.base.errors import NotFoundError
+from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import FormMoment, Lines, Name, Version, plant_time_to_utc
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_zone
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
-from service.jobs.enqueuing import delete_plan_for, enqueue
+from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import aim_plans, plans
+from service.jobs.kinds.aim_plans import AimPlanIn, DayIn
 from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.store.tables import PlantRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime.runtime import Runtime
-from service.web.auth.dependencies import OPERATE, READ, RENDER_SLOT, IdentityDep, RuntimeDep
-from service.web.pages.forecast import WHENS, SunlightForm, When, sunlight_fields, time_of
-from service.web.pages.plan_aims import aims_for, plan_with
-from service.web.responses.pages import go_to, leave_for, render
+from service.web.auth.dependencies import (
+    OPERATE,
+    READ,
+    RENDER_SLOT,
+    IdentityDep,
+    RuntimeDep,
+    ZoneDep,
+)
+from service.web.resources.forecasts import WHENS, SunlightForm, When, sunlight_fields, time_of
+from service.web.resources.jobs import delete_job
+from service.web.responses.pages import go_to, go_to_job, leave_for, render
 
-router = APIRouter(include_in_schema=False)
+pages = APIRouter(include_in_schema=False)
 
 LISTED = 20
 """Plans on a page of the list."""
@@ -131,12 +138,6 @@ def _likely(targets: list[str], zone: str) -> PlanForm:
     )
 
 
-def _at(form: object, at: datetime) -> PlanForm:
-    """The form for a single time."""
-    assert isinstance(form, PlanForm)
-    return form.model_copy(update={"first_at": at, "last_at": at})
-
-
 def _filled(asked: PlanIn) -> PlanForm:
     """The form from which a plan was requested."""
     aims = {name: f"{name} {right:g} {up:g}" for name, (right, up) in asked.aim_offsets_m.items()}
@@ -145,6 +146,62 @@ def _filled(asked: PlanIn) -> PlanForm:
     given |= sunlight_fields(asked.dni_w_m2)
     allowed = None if asked.allowed_w_m2 is None else asked.allowed_w_m2 / 1e3
     return PlanForm.model_construct(**given, heliostats="\n".join(lines), allowed_kw_m2=allowed)
+
+
+# --- aims
+# --------------------------------------------------------------------------------------------------
+
+
+_SHARED_WITH_AIMS = ("heliostats", "target", "plane", "receiver", "dni_w_m2")
+"""Fields that a plan has from aims, and aims from a plan."""
+
+
+def aims_for(
+    asked: PlanIn, zone: str, limit_w_m2: list[list[float]] | None = None
+) -> AimPlanIn | None:
+    """The aims that would keep the limit of a plan, on its first day; None without a limit.
+
+    ``limit_w_m2`` is a map of it, instead of the plan's number.
+    """
+    limit = limit_w_m2 or asked.allowed_w_m2
+    if limit is None:
+        return None
+    first, last = (at.astimezone(ZoneInfo(zone)) for at in (asked.first_at, asked.last_at))
+    day = DayIn(
+        date=first.date(),
+        first=first.time().replace(second=0, microsecond=0),
+        last=last.time() if last.date() == first.date() else time(23, 59),
+        step_minutes=asked.step_minutes,
+    )
+    names = (*_SHARED_WITH_AIMS, "neighbours", "measured_states", "model_version")
+    same = {name: getattr(asked, name) for name in names}
+    return AimPlanIn(**same, day=day, limit_w_m2=limit)
+
+
+def plan_with(session: Session, number: int) -> PlanIn:
+    """A plan of the times of a finished aim plan, with its aims.
+
+    Raises
+    ------
+    ConflictError
+        If the job has no aims for known times.
+    """
+    row = queue.get_job(session, number)
+    result = row.result or {}
+    times = [step["at"] for step in result.get("steps", [result]) if step.get("at")]
+    if row.kind != aim_plans.KIND.name or not times:
+        raise ConflictError(f"aims: job {number} has no aims for known times; choose an aim plan")
+    asked = AimPlanIn.model_validate(row.payload)
+    limit = asked.limit_w_m2
+    return PlanIn(
+        **{name: getattr(asked, name) for name in _SHARED_WITH_AIMS},
+        name=f"aims of job {number}",
+        first_at=datetime.fromisoformat(times[0]),
+        last_at=datetime.fromisoformat(times[-1]),
+        step_minutes=60.0 if asked.day is None else asked.day.step_minutes,
+        allowed_w_m2=None if isinstance(limit, list) else limit,
+        aim_plan=number,
+    )
 
 
 # --- results
@@ -290,15 +347,23 @@ def _day(session: Session, row: JobRow, at: int | None, zone: str) -> Day:
 
 
 def _context(
-    runtime: Runtime, session: Session, after: int | None, asked: PlanIn | None
+    runtime: Runtime,
+    session: Session,
+    zone: str,
+    after: int | None,
+    asked: PlanIn | None,
+    when: When | None = None,
 ) -> dict[str, object]:
     """The form, filled with a request or with defaults, and the list of plans."""
-    zone = plant_time_zone(session, runtime.settings.time_zone)
     receivers = [row.name for row in store.list_receivers(session)]
     targets = [*receivers, *(row.name for row in store.list_targets(session))]
+    filled = _likely(targets, zone) if asked is None else _filled(asked)
+    if when is not None:
+        at = time_of(when, zone, store.find_plant(session))
+        filled = filled.model_copy(update={"first_at": at, "last_at": at})
     plans = store.list_plans(session, LISTED + 1, after)
     return {
-        "filled": _likely(targets, zone) if asked is None else _filled(asked),
+        "filled": filled,
         "in_zone": in_zone(zone),
         "zone": zone,
         "whens": WHENS,
@@ -307,6 +372,8 @@ def _context(
         "plans": plans[:LISTED],
         "after": after,
         "older": plans[LISTED - 1].job if len(plans) > LISTED else None,
+        "job": None,
+        "day": None,
     }
 
 
@@ -314,25 +381,53 @@ After = Annotated[Version | None, Query(description="The last plan of the page b
 Number = Annotated[Version, Path(description="Id of the plan's job.")]
 
 
-@router.get("/plans", dependencies=[READ])
-def get_plans_page(
-    request: Request,
+def _list_context(
     runtime: RuntimeDep,
     after: After = None,
     aims: Annotated[Version | None, Query(description="Job of an aim plan to fill in.")] = None,
     when: Annotated[When | None, Query(description="A time to fill in.")] = None,
+) -> dict[str, object]:
+    with runtime.database.reading() as session:
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        asked = None if aims is None else plan_with(session, aims)
+        return _context(runtime, session, zone, after, asked, when)
+
+
+@pages.get("/plans", dependencies=[READ])
+def get_plans_page(
+    request: Request, listed: Annotated[dict[str, object], Depends(_list_context)]
 ) -> HTMLResponse:
     """The form, and the list of plans."""
+    return render(request, "plan.html", **listed)
+
+
+def plan_figures(
+    runtime: Runtime, number: int, after: int | None, at: int | None
+) -> dict[str, object]:
+    """What the page of a plan draws, with its request in the form."""
     with runtime.database.reading() as session:
-        asked = None if aims is None else plan_with(session, aims)
-        context = _context(runtime, session, after, asked)
-        if when is not None:
-            at = time_of(when, str(context["zone"]), session.get(PlantRow, 1))
-            context["filled"] = _at(context["filled"], at)
-    return render(request, "plan.html", **context, job=None, day=None)
+        row = queue.get_job(session, number, arrays=True)
+        zone = plant_time_zone(session, runtime.settings.time_zone)
+        asked = _requested(row)
+        context = _context(runtime, session, zone, after, asked)
+        day = None if row.result is None else _day(session, row, at, zone)
+    aims = None if day is None else aims_for(asked, zone)
+    return context | {
+        "job": row,
+        "day": day,
+        "is_live": row.state not in queue.ENDED,
+        "aims_s": None if aims is None else aim_plans.expected_plan_s(aims, runtime),
+    }
 
 
-@router.get("/plans/{number}", dependencies=[READ, RENDER_SLOT])
+def _requested(job: JobRow) -> PlanIn:
+    """The request of a plan; NotFoundError if it is another job."""
+    if job.kind != "plans":
+        raise NotFoundError(f"job {job.id} is no plan")
+    return PlanIn.model_validate(job.payload)
+
+
+@pages.get("/plans/{number}", dependencies=[READ, RENDER_SLOT])
 def get_plan_page(
     number: Number,
     request: Request,
@@ -341,55 +436,41 @@ def get_plan_page(
     at: Annotated[int | None, Query(ge=0, le=1000, description="Which time's maps.")] = None,
 ) -> HTMLResponse:
     """A plan, followed until it is done, with its request in the form."""
-    with runtime.database.reading() as session:
-        row = queue.get_job(session, number, arrays=True)
-        if row.kind != "plans":
-            raise NotFoundError(f"job {number} is no plan")
-        zone = plant_time_zone(session, runtime.settings.time_zone)
-        day = None if row.result is None else _day(session, row, at, zone)
-        asked = PlanIn.model_validate(row.payload)
-        context = _context(runtime, session, after, asked)
-        aims = None if day is None else aims_for(asked, zone)
-    return render(
-        request,
-        "plan.html",
-        **context,
-        job=row,
-        day=day,
-        is_live=row.state not in queue.ENDED,
-        aims_s=None if aims is None else aim_plans.expected_plan_s(aims, runtime),
-    )
+    return render(request, "plan.html", **plan_figures(runtime, number, after, at))
 
 
-@router.post("/plans/{number}/delete", dependencies=[OPERATE])
+@pages.post("/plans/{number}/delete", dependencies=[OPERATE])
 def post_deletion_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
     """Delete a plan, and return to the list."""
-    delete_plan_for(runtime, number, identity.name)
+    delete_job(number, runtime, identity)
     return go_to("/plans")
 
 
-@router.post("/plans", dependencies=[OPERATE])
+@pages.post("/plans", dependencies=[OPERATE])
 def post_plan_form(
-    request: Request, form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+    request: Request,
+    form: Annotated[PlanForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    zone: ZoneDep,
 ) -> Response:
     """Enqueue a plan, and go to its page.
 
     Errors are shown next to the form, which keeps its values.
     """
-    with runtime.database.reading() as session:
-        form = form.in_utc(plant_time_zone(session, runtime.settings.time_zone))
-    payload = form.payload()
-    row = enqueue(runtime, plans.KIND, payload, identity.name).row
+    row = enqueue(runtime, plans.KIND, form.in_utc(zone).payload(), identity.name).row
     return leave_for(request, f"/plans/{row.id}")
 
 
-@router.post("/aims", dependencies=[OPERATE])
+@pages.post("/aims", dependencies=[OPERATE])
 def post_aims_form(
-    request: Request, form: Annotated[PlanForm, Form()], runtime: RuntimeDep, identity: IdentityDep
+    request: Request,
+    form: Annotated[PlanForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    zone: ZoneDep,
 ) -> Response:
     """Enqueue aims for the times of the form, and go to the page of the job."""
-    with runtime.database.reading() as session:
-        zone = plant_time_zone(session, runtime.settings.time_zone)
     try:
         payload = aims_for(form.in_utc(zone).payload(), zone, form.limit_map())
     except ValidationError as error:
@@ -398,3 +479,23 @@ def post_aims_form(
         raise InvalidInputError("allowed_kw_m2: give the flux that the receiver can take")
     row = enqueue(runtime, aim_plans.KIND, payload, identity.name).row
     return leave_for(request, f"/jobs/{row.id}")
+
+
+def _plan(number: Number, runtime: RuntimeDep) -> PlanIn:
+    with runtime.database.reading() as session:
+        return _requested(queue.get_job(session, number))
+
+
+@pages.post("/plans/{number}/aims", dependencies=[OPERATE])
+def post_plan_aims_form(
+    number: Number,
+    plan: Annotated[PlanIn, Depends(_plan)],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+    zone: ZoneDep,
+) -> Response:
+    """Enqueue aims under the limit of a plan, and go to the page of the job."""
+    payload = aims_for(plan, zone)
+    if payload is None:
+        raise ConflictError(f"plan {number} has no limit; plan it again with an allowed flux")
+    return go_to_job(runtime, aim_plans.KIND, payload, identity)

@@ -1,5 +1,8 @@
-"""Jobs: enqueue, follow and cancel them."""
+"""Jobs: enqueue, follow and cancel them, and their pages."""
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from threading import Event
 from typing import Annotated, Any, Literal
@@ -7,48 +10,66 @@ from typing import Annotated, Any, Literal
 from fastapi import (
     APIRouter,
     Depends,
-    File,
     Header,
     HTTPException,
     Path,
     Query,
     Request,
     Response,
-    UploadFile,
     status,
 )
+from fastapi.responses import HTMLResponse
 from pydantic import Field
 
+from model.fleet import LOSSES
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
-from service.base.fields import Rows, State, Text, Version
+from service.base.fields import Rows, State, Version
+from service.drawing.charts import HeatMap
 from service.drawing.pictures import flux_picture
+from service.drawing.templates import in_zone
 from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
 from service.jobs.kinds.plans import MAX_TIMES, map_name
-from service.jobs.uploads import UploadedFolder, delete_upload, list_uploads, receive_upload
+from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.store.listing import Order, Period
+from service.store.sizes import sizes
+from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
+from service.twin.forecasts.watts import loss_chain
 from service.twin.runtime.runtime import Runtime
 from service.web.auth.dependencies import (
-    COMPUTE_SLOT,
     OPERATE,
     READ,
+    RENDER_SLOT,
     IdentityDep,
     KindsDep,
-    Limit,
     PresentedDep,
     RuntimeDep,
     StoppingDep,
-    accept_archive,
     require_json,
 )
+from service.web.resources.job_results import (
+    MOST,
+    OFFSETS,
+    AimView,
+    CalibrationView,
+    StepNumber,
+    aim_rows,
+    aim_view,
+    calibration_view,
+    excess,
+    flux_map,
+    is_plain,
+    payload_in_words,
+)
 from service.web.responses import formats
+from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
 from service.web.responses.openapi import TEXT, arrays, problems
-from service.web.responses.paging import OrderQuery, Page, Since, Until, page
+from service.web.responses.pages import go_to, render
+from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 from service.web.responses.representation import Maps
 
 
@@ -192,67 +213,33 @@ def _add_creator(router: APIRouter, kind: Kind[Any]) -> None:
 
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
+pages = APIRouter(include_in_schema=False)
+
+_PAGE = 50
+
+
+class JobsQuery(ListQuery):
+    """Which jobs are listed, newest first by default."""
+
+    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None
+    kind: KindName = None
+    order: OrderQuery = "down"
 
 
 @router.get("", responses=problems(), dependencies=[READ])
-def list_jobs(
-    runtime: RuntimeDep,
-    limit: Limit = 100,
-    after: Annotated[Version | None, Query(description="The last id of the page before.")] = None,
-    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
-    kind: KindName = None,
-    since: Since = None,
-    until: Until = None,
-    order: OrderQuery = "down",
-) -> Page[JobSummary]:
+def list_jobs(query: Annotated[JobsQuery, Query()], runtime: RuntimeDep) -> Page[JobSummary]:
     """List jobs, newest first. The complete job is at its `href`."""
     with runtime.database.reading() as session:
-        asked, direction = Period(since, until), Order(descending=order == "down")
         rows = queue.list_jobs(
-            session, limit + 1, after, state, kind, created=asked, order=direction
+            session,
+            query.limit + 1,
+            query.after,
+            query.state,
+            query.kind,
+            created=query.created,
+            order=query.by_id,
         )
-    items = [job_summary(row) for row in rows]
-    return page(items, limit)
-
-
-@router.post(
-    "/imports/uploads",
-    status_code=status.HTTP_201_CREATED,
-    responses=problems(413, 415, 429, 507),
-    dependencies=[OPERATE, Depends(accept_archive), COMPUTE_SLOT],
-)
-def post_import_upload(
-    file: Annotated[UploadFile, File(description="ZIP file of a measurement folder.")],
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-) -> UploadedFolder:
-    """Upload a measurement folder for an import.
-
-    `POST /v1/jobs/imports` imports it, with its `folder` and `uploaded`. It is deleted when its
-    import has ended, or after a day without one.
-    """
-    return receive_upload(runtime, file.file, file.filename or "", identity.name)
-
-
-@router.get("/imports/uploads", responses=problems(), dependencies=[READ])
-def list_import_uploads(runtime: RuntimeDep) -> Page[UploadedFolder]:
-    """List the uploaded measurement folders."""
-    return Page(items=list_uploads(runtime), next=None)
-
-
-@router.delete(
-    "/imports/uploads/{name}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    responses=problems(404, 409),
-    dependencies=[OPERATE],
-)
-def delete_import_upload(
-    name: Annotated[Text, Path(description="Name of the upload.")],
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-) -> None:
-    """Delete an uploaded measurement folder, unless a job is to import it."""
-    delete_upload(runtime, name, identity.name)
+    return page([job_summary(row) for row in rows], query.limit)
 
 
 @router.get("/{number}", responses=problems(404), dependencies=[READ])
@@ -342,3 +329,188 @@ def delete_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Jo
 def cancel_job(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> JobOut:
     """Cancel a job. A waiting one ends at once, a running one at its next progress report."""
     return job_out(cancel_for(runtime, number, identity.name))
+
+
+# --- pages
+# --------------------------------------------------------------------------------------------------
+
+
+def stored_sizes(runtime: Runtime) -> dict[str, object]:
+    """What the store holds, for the page of jobs."""
+    with runtime.database.reading() as session:
+        held = sizes(session)
+    settings = runtime.settings
+    return {
+        "held": held,
+        "kept": (
+            ("accepted", held.accepted, settings.image_retention_days),
+            ("refused", held.refused, settings.refused_image_retention_days),
+        ),
+        "quota_bytes": settings.image_quota_gb * 1e9,
+    }
+
+
+@pages.get("/jobs", dependencies=[READ])
+def get_jobs_page(
+    request: Request, runtime: RuntimeDep, after: Annotated[Version | None, Query()] = None
+) -> HTMLResponse:
+    """Jobs, newest first."""
+    jobs = list_jobs(JobsQuery(limit=_PAGE, after=after), runtime)
+    return render(
+        request,
+        "jobs.html",
+        jobs=jobs.items,
+        more=jobs.next,
+        after=after,
+        is_live=not all(job.has_ended for job in jobs.items),
+        **stored_sizes(runtime),
+    )
+
+
+_FACTORS = ("name", *LOSSES, "optical_efficiency", "intercepted_w")
+
+By = Annotated[
+    Literal[_FACTORS],  # type: ignore[valid-type]
+    Query(description="What the heliostats of a field forecast are sorted by."),
+]
+
+
+def _part(job: JobOut, part: str) -> Any:
+    """A part of the result of a job; NotFoundError if it has none."""
+    if part not in (job.result or {}):
+        raise NotFoundError(f"the result of job {job.id} has no {part}")
+    return (job.result or {})[part]
+
+
+GotJob = Annotated[JobOut, Depends(get_job)]
+
+
+@pages.get("/jobs/{number}/heliostats.csv", dependencies=[READ])
+def get_job_heliostats_table(job: GotJob) -> Response:
+    """What becomes of the light of each heliostat of a field forecast."""
+    columns = _FACTORS[1:]
+    lines = _part(job, "by_heliostat").items()
+    rows = ([name, *(one[column] for column in columns)] for name, one in lines)
+    return sheet_answer(f"job-{job.id}-heliostats", ("heliostat", *columns), rows)
+
+
+@pages.get("/jobs/{number}/states.csv", dependencies=[READ])
+def get_job_states_table(job: GotJob) -> Response:
+    """Measured states of mirrors of a field forecast, for ``heliotwin field --states``."""
+    return sheet_answer(f"job-{job.id}-states", STATE_COLUMNS, state_rows(_part(job, "states")))
+
+
+@pages.get("/jobs/{number}/aims.csv", dependencies=[READ])
+def get_job_aims_table(job: GotJob, step: StepNumber = 0) -> Response:
+    """The aims of a plan's step, as ``heliotwin field --aims`` reads them, and its drives."""
+    result = job.result or {}
+    steps = result.get("steps", [result])
+    if step >= len(steps) or "aim_points_m" not in steps[step]:
+        raise NotFoundError(f"the result of job {job.id} has no aims of a step {step}")
+    suffix = f"-step-{step}" if "steps" in result else ""
+    columns = (*AIM_COLUMNS, *DRIVE_COLUMNS)
+    return sheet_answer(f"job-{job.id}-aims{suffix}", columns, aim_rows(steps[step]))
+
+
+def _mirrors(result: Mapping[str, Any], by: str) -> list[tuple[str, dict[str, float]]]:
+    """The heliostats of a field forecast, sorted by a factor or their name."""
+    lines = list(result.get("by_heliostat", {}).items())
+    lines.sort(key=(lambda line: line[0]) if by == "name" else (lambda line: line[1][by]))
+    return lines
+
+
+@dataclass(frozen=True)
+class JobView:
+    """A job on its page, with the payload and the result if they were read."""
+
+    job: JobSummary
+    payload: Mapping[str, Any] | None = None
+    result: Mapping[str, Any] = field(default_factory=dict)
+    flux: HeatMap | None = None
+    aims: AimView | None = None
+    calibration: CalibrationView | None = None
+
+
+def read_view(
+    runtime: Runtime, kinds: Kinds, number: int, step: int, begin: int, is_update: bool
+) -> JobView:
+    """Read a job. An update while it runs needs neither the payload nor the result."""
+    with runtime.database.reading() as session:
+        row = queue.get_summary(session, number)
+        if is_update and row.state not in queue.ENDED:
+            return JobView(job_summary(row))
+        session.expunge(row)
+        row = queue.get_job(session, number, arrays=True)
+        result = result_of(kinds, session, row) or {}
+        return JobView(
+            job_summary(row),
+            row.payload,
+            result,
+            flux_map(row),
+            aim_view(session, row, step),
+            calibration_view(session, row, result, begin),
+        )
+
+
+_LISTS = ("counts", "surfaces", "unchanged", "judged", "warnings")
+"""Parts of results that the page shows as they are."""
+
+
+@pages.get("/jobs/{number}", dependencies=[READ, RENDER_SLOT])
+def get_job_page(
+    number: Number,
+    request: Request,
+    runtime: RuntimeDep,
+    kinds: KindsDep,
+    by: By = "name",
+    step: StepNumber = 0,
+    page: Annotated[int, Query(ge=1, le=10**6)] = 1,
+) -> HTMLResponse:
+    """A job, which the page follows until it ends.
+
+    The heliostats of a field forecast are sorted ``by`` their name or a factor, the least first.
+    Of a plan of aims the maps of one ``step`` are shown, and of long lists one ``page``.
+    """
+    begin, is_update = (page - 1) * MOST, "hx-request" in request.headers
+    view = read_view(runtime, kinds, number, step, begin, is_update)
+    job, result, calibration = view.job, view.result, view.calibration
+    mirrors, skipped = _mirrors(result, by), {} if calibration else result.get("skipped", {})
+    lists = mirrors, skipped, *(result.get(name, ()) for name in ("surfaces", "unchanged"))
+    longest = calibration.longest if calibration else max(map(len, lists))
+    return render(
+        request,
+        "job.html",
+        job=job,
+        is_live=not job.has_ended,
+        asked=None if view.payload is None else payload_in_words(view.payload),
+        flux=view.flux,
+        has_changed=any(result.values()),
+        chain=loss_chain(result["field"]) if result.get("field") else [],
+        mirrors=mirrors[begin : begin + MOST],
+        n_measured=len(result.get("states", ())),
+        n_mirrors=len(mirrors),
+        factors=_FACTORS,
+        by=by,
+        light=result if job.kind == "forecasts" and "peak_w_m2" in result else None,
+        aims=view.aims,
+        calibration=calibration,
+        offsets=OFFSETS,
+        excess=excess,
+        in_zone=in_zone(result.get("time_zone") or runtime.settings.time_zone),
+        target=(view.payload or {}).get("target"),
+        facts={name: value for name, value in result.items() if is_plain(value)},
+        **{name: result.get(name, {}) for name in _LISTS},
+        skipped=skipped,
+        shown=MOST,
+        begin=begin,
+        page=page,
+        last=math.ceil(longest / MOST),
+        link=lambda page: f"/jobs/{job.id}?by={by}&step={step}&page={page}#result-title",
+    )
+
+
+@pages.post("/jobs/{number}/cancel", dependencies=[OPERATE])
+def post_cancel_form(number: Number, runtime: RuntimeDep, identity: IdentityDep) -> Response:
+    """Cancel a job, and go to its page."""
+    cancel_job(number, runtime, identity)
+    return go_to(f"/jobs/{number}")

@@ -2,7 +2,7 @@
 
 import json
 from codecs import BOM_UTF8
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal, Self
@@ -48,10 +48,12 @@ from service.store.tables import ImageRow, MeasurementRow
 from service.twin.heliostats.metadata import spot_m
 from service.twin.photographs.repeats import receive
 from service.twin.runtime.runtime import Runtime
+from service.twin.surfaces.accuracy import photograph_name
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     INGEST,
     READ,
+    RENDER_SLOT,
     IdentityDep,
     Limit,
     MeasurementPath,
@@ -61,6 +63,7 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
+from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.files import WholeFile, etag_matches
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import BINARY, arrays, problems
@@ -346,6 +349,7 @@ def flux_answer(
 
 
 router = APIRouter(prefix="/heliostats/{name}/measurements", tags=["measurements"])
+pages = APIRouter(include_in_schema=False)
 
 # Generated clients know this media type of files, and no range such as ``image/*``.
 OCTETS = "application/octet-stream"
@@ -556,3 +560,64 @@ def get_flux(
             session, store.get_heliostat(session, name), measurement, arrays=True
         )
         return flux_answer(session, name, row, media_type)
+
+
+# --- the table
+# --------------------------------------------------------------------------------------------------
+
+
+_QUALITY = (
+    "signal_to_background",
+    "signal_to_noise",
+    "saturated_share",
+    "cut_share",
+    "second_spot_share",
+    "energy_outside_window",
+)
+_PHOTOGRAPH = (
+    "photograph",
+    "id",
+    "kind",
+    "accepted",
+    "reason",
+    "detail",
+    "taken_at",
+    "target",
+    "sun_azimuth_deg",
+    "sun_elevation_deg",
+    "motor_axis_1",
+    "motor_axis_2",
+    "center_right_m",
+    "center_up_m",
+    *_QUALITY,
+    "created_at",
+    "sent_by",
+    "corrected_at",
+    "image_sha256",
+)
+
+
+def _cell(row: MeasurementRow, column: str) -> object:
+    match column:
+        case "photograph":
+            return photograph_name(row)
+        case "id":
+            return row.identifier
+        case "target":
+            return row.target.name
+    of_quality = column in ("detail", *_QUALITY)
+    return row.quality.get(column) if of_quality else getattr(row, column)
+
+
+def _images(name: NamePath, runtime: RuntimeDep) -> Sequence[MeasurementRow]:
+    with runtime.database.reading() as session:
+        return store.list_measurements(session, store.get_heliostat(session, name), None)
+
+
+@pages.get("/heliostats/{name}/photographs.csv", dependencies=[READ, RENDER_SLOT])
+def get_photographs_table(
+    name: NamePath, images: Annotated[Sequence[MeasurementRow], Depends(_images)]
+) -> Response:
+    """All images of a heliostat's photographs, in the order of their arrival."""
+    rows = ([_cell(row, column) for column in _PHOTOGRAPH] for row in images)
+    return sheet_answer(f"{name}-photographs", _PHOTOGRAPH, rows)
