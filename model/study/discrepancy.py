@@ -17,7 +17,7 @@ Friedman, *The Elements of Statistical Learning* (2009), sections 3.4.1 and 7.10
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, groupby
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,7 +72,7 @@ Gauss-Newton and in the linear model, which is rough.
 """
 
 MIN_VARIED = 0.1
-"""Smallest deviation of a covariate within an owner, of that of all, for a scaling of its own."""
+"""Smallest deviation of a covariate within an owner, of that of all, with which it may scale."""
 
 LOCATED = 0.2
 """Largest share of the excess error that may stay unexplained where a discrepancy is located."""
@@ -418,19 +418,15 @@ class Discrepancy:
                     }
 
 
-class _Search:
-    """Forward selection of generic terms on top of a trial's effects."""
+class _Sample:
+    """Which photographs are fitted, their owners, covariates, and parts for cross-validation."""
 
-    def __init__(self, fitter: TrialFitter, effects: Sequence[Effect]) -> None:
-        self.fitter, options = fitter, fitter.options
-        rows = np.arange(len(fitter.flux_images))
-        self.model = GenericModel(fitter.forecaster(rows, options.view), effects, options.fit_view)
-        self.measured = self.model.forecaster.measured(FLUX_SIZE)
-        self.peaks = binned(self.measured, COARSE_SIZE).max(axis=(1, 2))[:, None]
-        self.is_fitted = np.isin(rows, fitter.split.fitted)
+    def __init__(self, fitter: TrialFitter) -> None:
+        count = len(fitter.flux_images)
+        self.is_fitted = np.isin(np.arange(count), fitter.split.fitted)
         names = {
-            "all": ["all"] * len(rows),
-            "camera": ["camera"] * len(rows),
+            "all": ["all"] * count,
+            "camera": ["camera"] * count,
             "heliostat": fitter.heliostats.tolist(),
             "target": [p.setup.plane.name for p in fitter.flux_images],
         }
@@ -442,10 +438,55 @@ class _Search:
             ).items()
             if np.ptp(values[self.is_fitted]) > 0
         }
-        self.folds = np.zeros(len(rows), dtype=np.int64)
+        self.folds = np.zeros(count, dtype=np.int64)
         for own in range(len(self.owners["heliostat"][0])):
             (some,) = np.nonzero(self.is_fitted & (self.owners["heliostat"][1] == own))
             self.folds[some] = np.arange(len(some)) % FOLDS
+
+    def scale(self, covariate: Covariate) -> Scale:
+        """Mean and deviation of a covariate of the fitted photographs."""
+        values = self.covariates[covariate][self.is_fitted]
+        limits = float(values.min()), float(values.max())
+        return Scale(float(values.mean()), float(values.std()), limits)
+
+    def varies(self, covariate: Covariate, owner: Owner) -> bool:
+        """Whether a covariate varies in the fitted photographs of an owner."""
+        values, own = self.covariates[covariate], self.owners[owner][1]
+        each = [values[self.is_fitted & (own == one)] for one in np.unique(own)]
+        usual = float(np.median([np.std(some) for some in each if len(some)]))
+        return usual > MIN_VARIED * self.scale(covariate).std
+
+    def terms(self, kind: GenericKind) -> list[GenericTerm]:
+        """All terms of a kind that the photographs may show."""
+        return [
+            GenericTerm(kind, scaling, owner)
+            for owner in kind.owners
+            if owner in ("all", "camera") or len(self.owners[owner][0]) > 1
+            for scaling in (None, *(self.covariates if kind.is_smooth else []))
+            if scaling is None or self.varies(scaling, owner)
+        ]
+
+    def count(self, term: GenericTerm) -> int:
+        """Number of a term's coefficients."""
+        of_owner = len(term.kind.components) * (1 + (term.scaling is not None))
+        return of_owner * len(self.owners[term.owner][0])
+
+    def simplest(self, choices: Sequence[TermChoice], share: float) -> TermChoice:
+        """The one of fewest coefficients among those that gain this share of the best one's."""
+        best = max(choices, key=lambda one: one.gain)
+        good = [one for one in choices if one.gain >= share * best.gain]
+        return min(good or [best], key=lambda one: (self.count(one.term), -one.gain))
+
+
+class _Search(_Sample):
+    """Forward selection of generic terms on top of a trial's effects."""
+
+    def __init__(self, fitter: TrialFitter, effects: Sequence[Effect]) -> None:
+        super().__init__(fitter)
+        rows, options = np.arange(len(fitter.flux_images)), fitter.options
+        self.model = GenericModel(fitter.forecaster(rows, options.view), effects, options.fit_view)
+        self.measured = self.model.forecaster.measured(FLUX_SIZE)
+        self.peaks = binned(self.measured, COARSE_SIZE).max(axis=(1, 2))[:, None]
 
     def residual(self, cuts: Array) -> Array:
         """Measured minus forecast (N, P), in shares of peaks."""
@@ -476,35 +517,11 @@ class _Search:
         owners = self.owners[term.owner][1][rows]
         return Regression(*point, np.stack(factors, axis=1)[rows], owners)
 
-    def scale(self, covariate: Covariate) -> Scale:
-        """Mean and deviation of a covariate of the fitted photographs."""
-        values = self.covariates[covariate][self.is_fitted]
-        limits = float(values.min()), float(values.max())
-        return Scale(float(values.mean()), float(values.std()), limits)
-
     def cross_validated(self, term: GenericTerm, point: Linearised, ridge: float) -> float:
         """Accuracy of the fitted photographs, those of ``point``, each by a fit without it."""
         regression = self.regression(term, point, self.is_fitted)
         left = regression.left_without(self.folds[self.is_fitted], ridge)
         return self.accuracy(left, self.is_fitted)
-
-    def terms(self) -> list[GenericTerm]:
-        """All terms that the photographs may show."""
-        return [
-            GenericTerm(kind, scaling, owner)
-            for kind in self.model.kinds
-            for owner in kind.owners
-            if owner in ("all", "camera") or len(self.owners[owner][0]) > 1
-            for scaling in (None, *(self.covariates if kind.is_smooth else []))
-            if scaling is None or self._varies(scaling, owner)
-        ]
-
-    def _varies(self, covariate: Covariate, owner: Owner) -> bool:
-        """Whether a covariate varies in the fitted photographs of an owner."""
-        values, own = self.covariates[covariate], self.owners[owner][1]
-        each = [values[self.is_fitted & (own == one)] for one in np.unique(own)]
-        usual = float(np.median([np.std(some) for some in each if len(some)]))
-        return usual > MIN_VARIED * self.scale(covariate).std
 
     def best(self, cuts: Array) -> TermChoice:
         """The simplest of the best terms.
@@ -525,29 +542,18 @@ class _Search:
             ]
 
         by_kind = [
-            choices(terms, self.linearise(kind, cuts), RIDGES[1:2])
-            for kind, terms in groupby(self.terms(), key=lambda term: term.kind)
+            choices(self.terms(kind), self.linearise(kind, cuts), RIDGES[1:2])
+            for kind in self.model.kinds
         ]
-        simplest = (self._simplest(own, SIMPLER_LINEAR) for own in by_kind)
+        simplest = (self.simplest(own, SIMPLER_LINEAR) for own in by_kind)
         screened = sorted(simplest, key=lambda one: -one.gain)
         finalists: list[TermChoice] = []
         for one in screened[:SCREENED]:
             point = self.iterate(one.term, one.ridge, cuts, one.point).point
             finalists += choices([one.term], point, RIDGES)
-        chosen = self._simplest(finalists, SIMPLER)
+        chosen = self.simplest(finalists, SIMPLER)
         others = sorted([*finalists, *chain(*by_kind)], key=lambda one: -one.gain)
         return replace(chosen, rival=find_rival(self, chosen, others))
-
-    def _simplest(self, choices: Sequence[TermChoice], share: float) -> TermChoice:
-        """The one of fewest coefficients among those that gain this share of the best one's."""
-        best = max(choices, key=lambda one: one.gain)
-        good = [one for one in choices if one.gain >= share * best.gain]
-        return min(good or [best], key=lambda one: (self._complexity(one.term), -one.gain))
-
-    def _complexity(self, term: GenericTerm) -> int:
-        """Number of a term's coefficients."""
-        of_owner = len(term.kind.components) * (1 + (term.scaling is not None))
-        return of_owner * len(self.owners[term.owner][0])
 
     def linearise(self, kind: GenericKind, cuts: Array) -> Linearised:
         """The linear model of a kind, about its best constant amounts if those are fast to find."""
