@@ -387,7 +387,7 @@ def _text(part: Any) -> Any:
     text = (
         part.file.read(_MAX_METADATA + 1).removeprefix(BOM_UTF8)
         if isinstance(part, UploadFile | StarletteUploadFile)
-        else part
+        else part.removeprefix("\ufeff")
     )
     with suppress(
         json.JSONDecodeError, UnicodeDecodeError, RecursionError
