@@ -22,6 +22,7 @@ from pydantic import Field
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
 from service.base.fields import Rows, State, Text, Version
+from service.base.names import KEY
 from service.drawing.pictures import flux_picture
 from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
@@ -131,7 +132,7 @@ IdempotencyKey = Annotated[
     str | None,
     Header(
         alias="Idempotency-Key",
-        pattern=r"^[\x21-\x7e]{1,128}$",
+        pattern=KEY,
         description=(
             "Any text of the sender's own: the same request with the same key is the same job,"
             " and its second answer has the header `Idempotency-Replayed`."
