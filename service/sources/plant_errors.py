@@ -84,7 +84,9 @@ def parse_plant(document: YamlDocument) -> PlantDocument:
     except ValidationError as error:
         mistakes = Mistakes()
         by_path = {_path(document, entry): entry for entry in error.errors(include_url=False)[::-1]}
-        for path in sorted(by_path, key=partial(_line, document)):
+        of_wrong_kind = {path[:-1] for path in by_path if path[-1:] == ("kind",)}
+        paths = [p for p in by_path if p[-1:] == ("kind",) or p[:-1] not in of_wrong_kind]
+        for path in sorted(paths, key=partial(_line, document)):
             mistakes.found.append(f"{document.place(path)}: {_message(by_path[path], path)}")
         mistakes.require_none()
         raise
