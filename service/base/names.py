@@ -42,6 +42,11 @@ def require_name(pattern: str, value: str, what: str) -> None:
         raise InvalidInputError(f"{what} {value[:40]!r}: must be {FORMS[pattern]}")
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: 1 heliostat, 2,650 heliostats."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def is_text(value: str) -> bool:
     """Whether a string has no lone surrogates or control characters (except line breaks, tabs)."""
     return _NO_TEXT.search(value) is None

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from service.base.names import counted
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.imported import (
     ImportedPlant,
@@ -167,7 +168,7 @@ def _layout(path: Path, lines: Sequence[ForeignLine], has_flags: bool) -> Import
             aims[f"H{number}"] = np.array(line.numbers(9, 3))
     if not heliostats:
         raise InvalidInputError(f"{path}: has no heliostat that is enabled and in the layout")
-    off = f"{n_off} heliostats that are not enabled or not in the layout are left out."
+    off = f"left out, as not enabled or not in the layout: {counted(n_off, 'heliostat')}."
     kinds = {entry.type: REFLECTANCE for entry in heliostats}
     return default_plant(path, heliostats, aims, kinds, [off] if n_off else [])
 

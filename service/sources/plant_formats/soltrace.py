@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.base.names import NAME
+from service.base.names import NAME, counted
 from service.sources.files import file_name, read_text, require_regular
 from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.mirror_design import FacetedMirror, MirrorDesign, design_of
@@ -313,12 +313,12 @@ def read_soltrace(path: Path) -> ImportedPlant:
             " middle; change their mounts to yours.",
             "pointing_error_mrad is SolTrace's specularity error: both spread the beam alike.",
             *(
-                [f"heliostats: {len(stages[0])} facets are {len(groups)} heliostats."]
+                [f"heliostats: {len(stages[0])} facets are {counted(len(groups), 'heliostat')}."]
                 if len(groups) < len(stages[0])
                 else []
             ),
             *_turn_notes(turned),
-            *([f"{n_off} elements are switched off, and left out."] if n_off else []),
+            *([f"left out, as switched off: {counted(n_off, 'element')}."] if n_off else []),
             *(
                 ("sun: a pillbox of the same spread replaces the file's table.",)
                 * (given.sun_shape == "d")

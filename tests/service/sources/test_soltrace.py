@@ -223,7 +223,7 @@ def test_a_stage_without_a_name_and_what_is_switched_off(tmp_path: Path):
     file.write_text(text.replace("ELEMENTS\t1", "ELEMENTS\t2", 1))
     imported = read_foreign(file)
     assert len(imported.heliostats) == 1
-    assert any("1 elements are switched off" in note for note in imported.notes)
+    assert any("switched off: 1 element." in note for note in imported.notes)
 
 
 def with_cells(text: str, change: Callable[[int, list[str]], list[str]]) -> str:
