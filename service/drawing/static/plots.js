@@ -151,7 +151,7 @@
   const options = (place, data, showZoom) => {
     const axis = { stroke: () => css("--soft"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { stroke: () => css("--edge"), width: 1, size: 5 } };
     const group = data.span.join();
-    // Above the values there is room for the legend, but no accuracy above 100 %.
+    // Above the values the legend has its space, but no accuracy is above 100 %.
     const below = (u, splits) => splits.map((value) => (data.unit === "%" && value > 100 ? null : value));
     const isWhole = (min, max) => min <= data.span[0] && max >= data.span[1];
     // All timelines with the same times zoom together, also by keyboard.
