@@ -91,7 +91,8 @@ def require_no_count(lines: Sequence[ForeignLine], names: str) -> None:
 
     Two lines of a layout may be of two templates.
     """
-    counted = [str(number + int(lines[0].cells[0] == "1")) for number in range(len(lines))]
+    start = int(lines[0].cells[0]) if lines[0].cells[0].isdecimal() else -1
+    counted = [str(start + number) for number in range(len(lines))]
     if len(lines) > 1 + (len(lines[0].cells) > 3) and [line.cells[0] for line in lines] == counted:
         raise lines[0].refuse(
             f"the first cells count the lines; put the names of columns above, such as {names}"

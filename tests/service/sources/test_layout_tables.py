@@ -74,6 +74,7 @@ def test_reflectance_is_the_files_or_is_said_to_be_assumed(
         ("0,5;81,2\n", "line 1: cells are separated by semicolons"),
         (f"{TITLES}{RESULTS}\n7,1,2".replace(RESULTS, RESULTS.replace(",", "\t")), "by tabs"),
         ("1,0,81\n2,5,90\n", "the first cells count the lines"),
+        ("101,0,81\n102,5,90\n103,6,95\n", "the first cells count the lines"),
         ("x,y,x\n0,81,3\n", "column 'x' is there twice"),
         (f"{RESULTS}\n", "no heliostat follows"),
         (COLUMNS + ROW.replace("NULL", "0.5"), "has a canting vector"),
