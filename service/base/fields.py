@@ -27,12 +27,11 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from model.plant import TargetPlane, require_plane_shape
 from service.base.choices import Method as Method  # also used by the command line
 from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
-from service.base.validation_messages import not_a_number
+from service.base.validation_messages import NO_TIME, not_a_number
 
 Name = Annotated[
     str,
@@ -132,7 +131,7 @@ def parse_moment(moment: datetime) -> datetime:
 def _read_moment(value: Any) -> Any:
     """Refuse numbers, which pydantic reads as seconds since 1970: 20260621 is no day of 1970."""
     if isinstance(value, int | float) or _SECONDS.fullmatch(str(value)):
-        raise PydanticCustomError("datetime_parsing", "Input should be a time")
+        raise ValueError(NO_TIME)
     with suppress(ValueError):
         return read_time(value) if isinstance(value, str) else value
     return value  # pydantic says what is wrong

@@ -19,7 +19,6 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from pydantic_core import InitErrorDetails
 
 from model.actuator import LinearActuator
 from model.plant import require_cylinder_shape
@@ -49,21 +48,15 @@ class PlantPart(Model):
         if not wrong:
             return validate(data)
         keys = {mistake.key for mistake in wrong}
-        found = [
-            InitErrorDetails(type="value_error", input=data, ctx={"error": mistake})
-            for mistake in wrong
+        found: list[Any] = [
+            {"type": "value_error", "input": data, "ctx": {"error": mistake}} for mistake in wrong
         ]
         try:
             validate({key: value for key, value in data.items() if key not in keys})
         except ValidationError as error:
             meant = {mistake.meant for mistake in wrong}
             found += [
-                InitErrorDetails(
-                    type=entry["type"],
-                    loc=entry["loc"],
-                    input=entry["input"],
-                    ctx=entry.get("ctx", {}),
-                )
+                {key: entry.get(key, {}) for key in ("type", "loc", "input", "ctx")}
                 for entry in error.errors(include_url=False)
                 if entry["type"] != "missing" or entry["loc"][0] not in meant
             ]
