@@ -24,7 +24,7 @@ def new_axes(ax: Axes | None) -> Axes:
     return pyplot.figure(layout="constrained").subplots() if ax is None else ax
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Surface:
     """The mirror surface of a heliostat.
 
@@ -51,13 +51,20 @@ class Surface:
 
     heliostat: str
     source: Literal["ideal", "measured", "network", "refined", "given"]
-    z: Array = field(repr=False)
-    control_points: Array = field(repr=False)
+    z: Array
+    control_points: Array
     degree: int = 3
-    z_std: Array | None = field(default=None, repr=False)
+    z_std: Array | None = None
     images: tuple[str, ...] = ()
     misfit: float | None = None
     warnings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        parts = [self.heliostat, self.source, f"{len(self.z)} facets"]
+        parts += [f"{len(self.images)} photographs"] if self.images else []
+        parts += [f"{self.misfit:.1%} unexplained"] if self.misfit is not None else []
+        parts += [f"{len(self.warnings)} warnings"] if self.warnings else []
+        return f"Surface({', '.join(parts)})"
 
     def plot(self, bound_mm: float = 2.0, ax: Axes | None = None) -> Axes:
         """Draw the heights over the ideal facets [mm], seen from the front.
@@ -81,7 +88,7 @@ class Surface:
         return axes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Flux:
     """The flux of one heliostat on a plane, or on the unrolled map of a cylinder.
 
@@ -102,13 +109,18 @@ class Flux:
         Azimuth from north over east, and elevation.
     """
 
-    flux: NDArray[np.float32] = field(repr=False)
+    flux: NDArray[np.float32]
     size_m: tuple[float, float]
     peak_w_m2: float
     power_w: float
-    center_of_mass_m: Array | None = field(repr=False)
-    camera_view: NDArray[np.float32] | None = field(repr=False)
+    center_of_mass_m: Array | None
+    camera_view: NDArray[np.float32] | None
     sun_deg: tuple[float, float]
+
+    def __repr__(self) -> str:
+        size, sun = "{:.3g} x {:.3g} m".format(*self.size_m), "{:.1f}, {:.1f}".format(*self.sun_deg)
+        peak, power = f"{self.peak_w_m2 / 1e3:.3g} kW/m2", f"{self.power_w / 1e3:.3g} kW"
+        return f"Flux({size}, peak {peak}, power {power}, sun {sun} deg)"
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the map [kW/m2] into ``ax``, by default of a new figure; return the axes."""

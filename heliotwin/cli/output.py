@@ -119,11 +119,18 @@ def require_unbroken(folder: "MeasurementFolder") -> None:
         raise InvalidInputError(f"{first}{more}; all but {', '.join(folder.broken)} is done")
 
 
+_LABELS = {
+    "peak_p95_w_m2": "peak in 95 % of cases",
+    "single_aim_power_w": "power if all aim at the middle",
+    "bound_w": "no aims give more than",
+}
+
+
 def quantity_table(title: str, figures: Mapping[str, Any]) -> Table:
     """A table of numbers by names that end with their units."""
     table = make_table(title, "quantity", "value")
     for name, value in figures.items():
-        label = name.removesuffix("_m2").removesuffix("_w").replace("_", " ")
+        label = _LABELS.get(name, name.removesuffix("_m2").removesuffix("_w").replace("_", " "))
         table.add_row(label, quantity_text(name, value))
     return table
 

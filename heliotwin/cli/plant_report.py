@@ -7,6 +7,7 @@ from heliotwin.cli.output import make_table
 from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity, Panels
+from service.base.names import counted
 from service.sources.documents import describe_sun
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_receivers import AnyReceiver
@@ -96,7 +97,7 @@ def plant_lines(described: PlantDescription) -> list[str]:
     )
     lost = np.polynomial.polynomial.polyval([0.5, 1.0], air or [0.0])
     lines = [
-        f"{report['plant']}: {len(described.plant.heliostats):,} heliostats,"
+        f"{report['plant']}: {counted(len(described.plant.heliostats), 'heliostat')},"
         f" {report['mirror_area_m2']:,.0f} m2 of mirrors",
         f"sun: {sun}",
         f"air: {lost[0]:.1%} lost over 500 m, {lost[1]:.1%} over 1 km",

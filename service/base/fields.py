@@ -4,7 +4,9 @@ Numbers are finite, unknown keys are rejected, and names fit a pattern that is s
 URLs.
 """
 
+import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import UTC, date, datetime, time, timedelta
 from itertools import islice
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -29,7 +31,7 @@ from pydantic import (
 from model.plant import TargetPlane, require_plane_shape
 from service.base.choices import Method as Method  # also used by the command line
 from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
-from service.base.validation_messages import not_a_number
+from service.base.validation_messages import NO_TIME, not_a_number
 
 Name = Annotated[
     str,
@@ -126,7 +128,17 @@ def parse_moment(moment: datetime) -> datetime:
     return utc.astimezone(UTC)
 
 
-Moment = Annotated[AwareDatetime, AfterValidator(parse_moment)]
+def _read_moment(value: Any) -> Any:
+    """Refuse numbers, which pydantic reads as seconds since 1970: 20260621 is no day of 1970."""
+    if isinstance(value, int | float) or _SECONDS.fullmatch(str(value)):
+        raise ValueError(NO_TIME)
+    with suppress(ValueError):
+        return read_time(value) if isinstance(value, str) else value
+    return value  # pydantic says what is wrong
+
+
+_SECONDS = re.compile(r"\s*[-+]?[0-9.]+\s*")
+Moment = Annotated[AwareDatetime, BeforeValidator(_read_moment), AfterValidator(parse_moment)]
 
 
 def read_time(text: str) -> datetime:

@@ -22,12 +22,14 @@ LINE = r"^[^\x00-\x1f\x7f-\x9f]*$"
 LINES = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]*$"
 """Free text with optional line breaks and tabs."""
 
+KEY = r"^[\x21-\x7e]{1,128}$"
 FORMS = {
     pattern: f"1 to {most} letters, digits, underscores and hyphens, the first a letter or digit"
     for pattern, most in ((NAME, 32), (IDENTIFIER, 64), (MEASUREMENT, 96))
 } | {
     LINE: "one line of text without control characters",
     LINES: "text without control characters other than line breaks and tabs",
+    KEY: "1 to 128 letters, digits and signs of ASCII without blanks",
 }
 """Descriptions of the patterns."""
 
@@ -38,6 +40,11 @@ def require_name(pattern: str, value: str, what: str) -> None:
     """Raise `InvalidInputError` unless ``value`` fits ``pattern``; ``what`` describes the name."""
     if re.fullmatch(pattern, value) is None:
         raise InvalidInputError(f"{what} {value[:40]!r}: must be {FORMS[pattern]}")
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: 1 heliostat, 2,650 heliostats."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def is_text(value: str) -> bool:

@@ -11,7 +11,8 @@ from service.base.names import FORMS
 
 _OBJECT = "must be a JSON object, {..}"
 _LIST = "must be a list, [..]"
-_TIME = "must be a time such as 2026-06-21T11:36:00Z"
+NO_TIME = "must be a time such as 2026-06-21T11:36:00Z"
+"""The message that a value is no time."""
 _DEEP = "is nested too deeply; send it flatter"
 _OTHERWISE = "must be of the form that /docs shows"
 
@@ -22,6 +23,10 @@ ERROR_MESSAGES: Mapping[str, str] = {
     "none_required": "must be null, or left out",
     "timezone_aware": "names no time zone; add it, such as Z or +02:00",
     "int_parsing_size": "must be a smaller whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_parsing": "must be a number",
+    "bool_parsing": "must be true or false",
     "string_type": 'must be text, ".."',
     "string_unicode": "must be text of valid Unicode",
     "bytes_type": 'must be text, ".."',
@@ -34,8 +39,8 @@ ERROR_MESSAGES: Mapping[str, str] = {
     **dict.fromkeys(("model_type", "model_attributes_type"), _OBJECT),
     **dict.fromkeys(("list_type", "tuple_type", "set_type"), _LIST),
     **dict.fromkeys(("frozen_set_type", "iterable_type"), _LIST),
-    **dict.fromkeys(("datetime_type", "datetime_parsing"), _TIME),
-    **dict.fromkeys(("datetime_from_date_parsing", "datetime_object_invalid"), _TIME),
+    **dict.fromkeys(("datetime_type", "datetime_parsing"), NO_TIME),
+    **dict.fromkeys(("datetime_from_date_parsing", "datetime_object_invalid"), NO_TIME),
 }
 """Messages by pydantic's error type, if its own message names a Python type or no remedy."""
 

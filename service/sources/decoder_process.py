@@ -60,6 +60,7 @@ _PNG_NEEDED = {b"IHDR", b"PLTE", b"eXIf", b"IDAT", b"IEND"}
 _TIFF_SIZES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8])
 _TIFF_NUMBERS = {3: "u2", 4: "u4"}  # SHORT and LONG
 _TIFF_MOST_TAGS = 512
+_TIFF_SUBFILE = 254  # kind of a page
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_PHOTOMETRIC, _TIFF_FORMAT, _WHITE_IS_ZERO, _UNSIGNED = 262, 339, 0, {1, 4}
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
@@ -214,14 +215,28 @@ def _unlike_a_tiff(why: str) -> InvalidInputError:
     return InvalidInputError(f"image: a TIFF {why}; save it again, as PNG or JPEG")
 
 
-def _tiff_tags(data: bytes, order: str) -> dict[int, NDArray[Any]]:
-    """The entries of the first directory by tag: ``kind``, ``count``, and ``place`` of their
-    values.
+def _next_directory(data: bytes, order: str, start: int) -> int:
+    """Where the directory behind that at ``start`` begins; 0 behind the last."""
+    (count,) = struct.unpack_from(order + "H", data, start)
+    return int(struct.unpack_from(order + "I", data, start + 2 + 12 * count)[0])
+
+
+def _require_one_picture(data: bytes, order: str) -> None:
+    """Refuse a second page; a preview, of reduced resolution, is none."""
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    page = _next_directory(data, order, start)
+    if page:
+        kind = _tiff_tags(data, order, page).get(_TIFF_SUBFILE)
+        if kind is None or not struct.unpack_from(order + "I", data, int(kind["place"]))[0] & 1:
+            raise _unlike_a_tiff("of several pages is not supported; send one picture")
+
+
+def _tiff_tags(data: bytes, order: str, start: int) -> dict[int, NDArray[Any]]:
+    """The entries of a directory by tag: ``kind``, ``count``, and ``place`` of their values.
 
     Tags must be unique and in ascending order, as TIFF 6.0 says. Otherwise libtiff could use
     another entry than the one that was checked.
     """
-    (start,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, start)
     if count > _TIFF_MOST_TAGS:
         raise _unlike_a_tiff(f"of {count} tags, {_TIFF_MOST_TAGS} are the most, is not supported")
@@ -252,7 +267,8 @@ def _tiff_tags(data: bytes, order: str) -> dict[int, NDArray[Any]]:
 def _check_tiff(data: bytes) -> CheckedFile:
     order = "<" if data.startswith(b"II") else ">"
     try:
-        tags = _tiff_tags(data, order)
+        tags = _tiff_tags(data, order, *struct.unpack_from(order + "I", data, 4))
+        _require_one_picture(data, order)
     except InvalidInputError:
         raise
     except (struct.error, ValueError) as error:  # the directory lies beyond the end

@@ -1,5 +1,6 @@
 """Mistakes in ``plant.yaml``, each in one line: file, line, key path, and what to do."""
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,9 +60,21 @@ class Mistakes:
     def require_none(self) -> None:
         """Raise InvalidInputError with all mistakes, one a line."""
         if self.found:
-            more = len(self.found) - _MOST_MISTAKES
+            lines = [line for mistake in self.found for line in mistake.split("\n")]
+            files = list(dict.fromkeys(map(_file_of, lines)))
+            lines.sort(key=lambda line: (files.index(_file_of(line)), _number_of(line)))
+            more = len(lines) - _MOST_MISTAKES
             rest = [f"and {more} more"] if more > 0 else []
-            raise InvalidInputError("\n".join([*self.found[:_MOST_MISTAKES], *rest]))
+            raise InvalidInputError("\n".join([*lines[:_MOST_MISTAKES], *rest]))
+
+
+def _file_of(mistake: str) -> str:
+    return re.split(", line |:", mistake, maxsplit=1)[0]
+
+
+def _number_of(mistake: str) -> int:
+    found = re.match(r".*?, line (\d+)", mistake)
+    return int(found[1]) if found else 0
 
 
 def parse_plant(document: YamlDocument) -> PlantDocument:
@@ -71,7 +84,9 @@ def parse_plant(document: YamlDocument) -> PlantDocument:
     except ValidationError as error:
         mistakes = Mistakes()
         by_path = {_path(document, entry): entry for entry in error.errors(include_url=False)[::-1]}
-        for path in sorted(by_path, key=partial(_line, document)):
+        of_wrong_kind = {path[:-1] for path in by_path if path[-1:] == ("kind",)}
+        paths = [p for p in by_path if p[-1:] == ("kind",) or p[:-1] not in of_wrong_kind]
+        for path in sorted(paths, key=partial(_line, document)):
             mistakes.found.append(f"{document.place(path)}: {_message(by_path[path], path)}")
         mistakes.require_none()
         raise
@@ -92,7 +107,7 @@ class PlantText:
         Raises
         ------
         InvalidInputError
-            It names file, line and key path of the first mistake.
+            It names file, line and key path of each mistake.
         """
         document = read_yaml(path)
         return cls(path.parent, document, parse_plant(document))
@@ -103,19 +118,24 @@ class PlantText:
 
     def file(self, name: str, *path: str | int) -> Path:
         """A file that the document names, within its folder."""
-        file, place = self.folder / name, self.document.place(path)
-        try:
-            is_inside = file.resolve().is_relative_to(self.folder.resolve())
-        except (OSError, RuntimeError):
-            is_inside = False
-        if Path(name).is_absolute() or not is_inside:
-            raise InvalidInputError(
-                f"{place}: {name[:60]!r} leads outside of the folder of plant.yaml; copy the file"
-                " into it"
-            )
-        if not file.exists():
-            raise InvalidInputError(f"{place}: no such file as {name[:60]!r} beside plant.yaml")
-        return file
+        return named_file(self.folder, self.document, name, *path)
+
+
+def named_file(folder: Path, document: YamlDocument, name: str, *path: str | int) -> Path:
+    """A file that a document of ``folder`` names at ``path``, within the folder."""
+    file, place = folder / name, document.place(path)
+    try:
+        is_inside = file.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):
+        is_inside = False
+    if Path(name).is_absolute() or not is_inside:
+        raise InvalidInputError(
+            f"{place}: {name[:60]!r} leads outside of the folder of plant.yaml; copy the file into"
+            " it"
+        )
+    if not file.exists():
+        raise InvalidInputError(f"{place}: no such file as {name[:60]!r} beside plant.yaml")
+    return file
 
 
 @contextmanager

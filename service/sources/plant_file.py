@@ -17,7 +17,7 @@ from model.site import Site
 from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
-from service.sources.plant_errors import Mistakes, PlantText, mistakes_at
+from service.sources.plant_errors import Mistakes, PlantText, mistakes_at, named_file, parse_plant
 from service.sources.plant_receivers import AnyReceiver, read_receivers, read_targets
 from service.sources.plant_schema import (
     BuieSun,
@@ -30,6 +30,7 @@ from service.sources.plant_schema import (
 )
 from service.sources.plant_tables import PlacedHeliostat, read_layout
 from service.sources.plant_types import read_type
+from service.sources.yaml_text import YamlDocument, read_yaml
 
 Array = NDArray[np.float64]
 
@@ -94,7 +95,25 @@ def read_plant(path: Path) -> PlantDescription:
     InvalidInputError
         It names file, line and key path of each mistake, and what to do.
     """
-    return _PlantReader(PlantText.read(path)).plant()
+    document = read_yaml(path)
+    try:
+        entries = parse_plant(document)
+    except InvalidInputError as error:
+        _require_layout_too(path.parent, document, str(error))
+        raise
+    return _PlantReader(PlantText(path.parent, document, entries)).plant()
+
+
+def _require_layout_too(folder: Path, document: YamlDocument, found: str) -> None:
+    """Raise the mistakes ``found`` in a document with those of the layout that it names, if any."""
+    layout = document.value.get("layout") if isinstance(document.value, dict) else None
+    name = layout.get("file") if isinstance(layout, dict) else None
+    if isinstance(name, str):
+        mistakes = Mistakes()
+        mistakes.found.append(found)
+        with mistakes.collected():
+            _require_different(read_layout(named_file(folder, document, name), mistakes), mistakes)
+        mistakes.require_none()
 
 
 class _PlantReader:
@@ -120,10 +139,11 @@ class _PlantReader:
             with mistakes.collected():
                 types[name] = read_type(self.text, name)
         with mistakes.collected():
-            layout = self._layout()
+            layout = self._layout(mistakes)
         for check in (self._time_zone, self._sun, self._attenuation):
             with mistakes.collected():
                 check()
+        _check_names(layout, self.entries, mistakes)
         mistakes.require_none()
         goals: dict[str, AnyReceiver] = {**receivers, **targets}
         receiver_of = self._receiver_of(layout, goals)
@@ -192,16 +212,16 @@ class _PlantReader:
 
     # --- heliostats
 
-    def _layout(self) -> list[PlacedHeliostat]:
+    def _layout(self, mistakes: Mistakes) -> list[PlacedHeliostat]:
         layout = self.entries.layout
         if layout.file is not None:
-            placed = read_layout(self.text.file(layout.file, "layout", "file"))
+            placed = read_layout(self.text.file(layout.file, "layout", "file"), mistakes)
         else:
             placed = [
                 PlacedHeliostat(self._place("layout", "heliostats", index), entry)
                 for index, entry in enumerate(layout.heliostats or ())
             ]
-        _require_different(placed)
+        _require_different(placed, mistakes)
         return placed
 
     def _receiver_of(
@@ -212,15 +232,7 @@ class _PlantReader:
                 f"{self._place()}: has neither receivers nor targets; heliostats need something to"
                 " aim at"
             )
-        first, mistakes = next(iter(goals)), Mistakes()
-        for placed in layout:
-            if (placed.entry.receiver or first) not in goals:
-                known = nearest(str(placed.entry.receiver), list(goals))
-                mistakes.found.append(
-                    f"{placed.place}: receiver: {placed.entry.receiver!r} is no receiver or target;"
-                    f" {known}"
-                )
-        mistakes.require_none()
+        first = next(iter(goals))
         return {placed.entry.name: placed.entry.receiver or first for placed in layout}
 
     def _heliostats(
@@ -234,20 +246,30 @@ class _PlantReader:
         for placed in layout:
             entry = placed.entry
             with mistakes.collected():
-                if entry.type not in types:
-                    known = nearest(entry.type, list(types))
-                    raise InvalidInputError(
-                        f"{placed.place}: type: {entry.type[:60]!r} is no heliostat type; {known}"
-                    )
                 goal = goals[receiver_of[entry.name]]
                 heliostats[entry.name] = place_heliostat(placed, types[entry.type], goal)
         mistakes.require_none()
         return heliostats
 
 
-def _require_different(layout: list[PlacedHeliostat]) -> None:
-    """Refuse two heliostats of one name, or within a centimetre of one place."""
-    mistakes = Mistakes()
+def _check_names(layout: list[PlacedHeliostat], entries: PlantDocument, mistakes: Mistakes) -> None:
+    """Collect types and receivers of heliostats that the document does not have."""
+    types, goals = list(entries.heliostat_types), [*entries.receivers, *entries.targets]
+    for placed in layout:
+        kind, goal = placed.entry.type, placed.entry.receiver
+        if kind not in types:
+            mistakes.found.append(
+                f"{placed.place}: type: {kind[:60]!r} is no heliostat type; {nearest(kind, types)}"
+            )
+        if goals and goal and goal not in goals:
+            mistakes.found.append(
+                f"{placed.place}: receiver: {goal!r} is no receiver or target;"
+                f" {nearest(goal, goals)}"
+            )
+
+
+def _require_different(layout: list[PlacedHeliostat], mistakes: Mistakes) -> None:
+    """Collect heliostats of one name, or within a centimetre of one place."""
     names: dict[str, str] = {}
     places: dict[tuple[float, ...], PlacedHeliostat] = {}
     for placed in layout:
@@ -264,7 +286,6 @@ def _require_different(layout: list[PlacedHeliostat]) -> None:
                 f" {places[foot].place}; move or remove one"
             )
         names[entry.name], places[foot] = placed.place, placed
-    mistakes.require_none()
 
 
 def place_heliostat(

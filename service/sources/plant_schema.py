@@ -13,8 +13,10 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    ModelWrapValidatorHandler,
     StringConstraints,
     Tag,
+    ValidationError,
     model_validator,
 )
 
@@ -37,17 +39,28 @@ UP = (0.0, 0.0, 1.0)
 class PlantPart(Model):
     """Base of all parts: suggests the nearest key for one that is unknown."""
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            known = [field.alias or name for name, field in cls.model_fields.items()]
-            for key, value in data.items():
-                if key not in known:
-                    raise KeyMistakeError(key, f"is not known here; {nearest(key, known)}")
-                if value is None:
-                    raise KeyMistakeError(key, "has no value; write one, or leave the key out")
-        return data
+    def _known_keys(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """Name unknown and empty keys beside the mistakes of all others."""
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        wrong = list(_wrong_keys(data, known)) if isinstance(data, dict) else []
+        if not wrong:
+            return validate(data)
+        keys = {mistake.key for mistake in wrong}
+        found: list[Any] = [
+            {"type": "value_error", "input": data, "ctx": {"error": mistake}} for mistake in wrong
+        ]
+        try:
+            validate({key: value for key, value in data.items() if key not in keys})
+        except ValidationError as error:
+            meant = {mistake.meant for mistake in wrong}
+            found += [
+                {key: entry.get(key, {}) for key in ("type", "loc", "input", "ctx")}
+                for entry in error.errors(include_url=False)
+                if entry["type"] != "missing" or entry["loc"][0] not in meant
+            ]
+        raise ValidationError.from_exception_data(cls.__name__, found)
 
     def require_one(self, *keys: str) -> None:
         """Refuse the part unless exactly one of ``keys`` is given."""
@@ -59,11 +72,20 @@ class PlantPart(Model):
 
 
 class KeyMistakeError(ValueError):
-    """A mistake of one ``key`` of a part, found before its values are."""
+    """A mistake of one ``key`` of a part, and the key that is ``meant``."""
 
-    def __init__(self, key: str, message: str) -> None:
+    def __init__(self, key: str, message: str, meant: str = "") -> None:
         super().__init__(f"{key}: {message}")
-        self.key, self.message = key, message
+        self.key, self.message, self.meant = key, message, meant
+
+
+def _wrong_keys(data: Mapping[str, Any], known: Sequence[str]) -> Iterator[KeyMistakeError]:
+    for key, value in data.items():
+        if key not in known:
+            meant = next((name for name in known if f" {name}?" in nearest(key, known)), "")
+            yield KeyMistakeError(key, f"is not known here; {nearest(key, known)}", meant)
+        elif value is None:
+            yield KeyMistakeError(key, "has no value; write one, or leave the key out", key)
 
 
 def nearest(word: str, known: Sequence[str]) -> str:

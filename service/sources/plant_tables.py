@@ -73,14 +73,20 @@ class CsvColumns:
         return [*self.required, *self.optional]
 
 
-def read_rows(path: Path, columns: CsvColumns, most: int) -> list[CsvRow]:
+def read_rows(
+    path: Path, columns: CsvColumns, most: int, mistakes: Mistakes | None = None
+) -> list[CsvRow]:
     """Rows of a CSV file; raises what `parse_rows` raises."""
-    return parse_rows(file_name(path), read_text(path, MAX_CSV_BYTES), columns, most)
+    return parse_rows(file_name(path), read_text(path, MAX_CSV_BYTES), columns, most, mistakes)
 
 
-def parse_rows(name: str, text: str, columns: CsvColumns, most: int) -> list[CsvRow]:
+def parse_rows(
+    name: str, text: str, columns: CsvColumns, most: int, mistakes: Mistakes | None = None
+) -> list[CsvRow]:
     """Rows of the text of a CSV file with one line of column names; blank lines and those from
     ``#`` on are skipped.
+
+    ``mistakes`` collects lines of other than one cell a column, if given.
 
     Raises
     ------
@@ -88,6 +94,7 @@ def parse_rows(name: str, text: str, columns: CsvColumns, most: int) -> list[Csv
         If it cannot be read, columns are missing, unknown or there twice, a line has other than one
         cell a column, or there are no rows or more than ``most``. It names file and line.
     """
+    wrong = Mistakes() if mistakes is None else mistakes
     lines = csv_lines(name, text)
     head = next(lines, None)
     if head is None:
@@ -96,11 +103,16 @@ def parse_rows(name: str, text: str, columns: CsvColumns, most: int) -> list[Csv
     rows: list[CsvRow] = []
     for line in lines:
         if len(line.cells) != len(standard):
-            raise line.refuse(f"has {len(line.cells)} cells, {len(standard)} are the columns")
+            wrong.found.append(
+                f"{line.place}: has {len(line.cells)} cells, {len(standard)} are the columns"
+            )
+            continue
         if len(rows) == most:
             raise line.refuse(f"at most {most} lines are read")
         rows.append(CsvRow(line.place, dict(zip(standard, line.cells, strict=True))))
-    if not rows:
+    if mistakes is None:
+        wrong.require_none()
+    if not rows and not wrong.found:
         raise InvalidInputError(f"{name}: has no line below its column names")
     return rows
 
@@ -142,13 +154,18 @@ class PlacedHeliostat:
     entry: HeliostatEntry
 
 
-def read_layout(path: Path) -> list[PlacedHeliostat]:
-    """Heliostats of a layout file; InvalidInputError names file and line of each mistake."""
-    placed, mistakes = [], Mistakes()
-    for row in read_rows(path, _LAYOUT, MAX_HELIOSTATS):
+def read_layout(path: Path, mistakes: Mistakes) -> list[PlacedHeliostat]:
+    """Heliostats of a layout file, without those of wrong lines, which ``mistakes`` collects.
+
+    Raises
+    ------
+    InvalidInputError
+        As of `parse_rows`.
+    """
+    placed = []
+    for row in read_rows(path, _LAYOUT, MAX_HELIOSTATS, mistakes):
         with mistakes.collected():
             placed.append(PlacedHeliostat(row.place, _heliostat(row)))
-    mistakes.require_none()
     return placed
 
 
@@ -201,7 +218,12 @@ def parse_facets(name: str, text: str) -> Sequence[FacetDesign]:
         raise InvalidInputError(
             f"{name}, line 1: has normals and cantings; keep the columns of one"
         )
-    return tuple(map(_facet, rows))
+    facets, mistakes = [], Mistakes()
+    for row in rows:
+        with mistakes.collected():
+            facets.append(_facet(row))
+    mistakes.require_none()
+    return tuple(facets)
 
 
 def _facet(row: CsvRow) -> FacetDesign:

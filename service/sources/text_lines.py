@@ -88,8 +88,10 @@ def csv_lines(name: str, text: str) -> Iterator[ForeignLine]:
             line = ForeignLine(f"{name}, line {reader.line_num}", [cell.strip() for cell in cells])
             if not any(line.cells) or line.cells[0].startswith("#"):
                 continue
+            if is_first and line.cells == ["sep=", ""]:  # a hint for Excel
+                continue
             if is_first:
-                _require_commas(line)
+                require_commas(line)
             if not all(map(is_text, line.cells)):
                 raise line.refuse("has a control character; remove it")
             is_first = False
@@ -98,10 +100,11 @@ def csv_lines(name: str, text: str) -> Iterator[ForeignLine]:
         raise InvalidInputError(f"{name}: is no CSV ({error})") from None
 
 
-def _require_commas(line: ForeignLine) -> None:
+def require_commas(line: ForeignLine) -> None:
+    """Refuse a first line whose cells hold another separator; names it."""
     for separator, word in _SEPARATORS.items():
-        parts = line.cells[0].split(separator)
-        if len(parts) > 1 and (separator != " " or not any(map(math.isnan, map(to_number, parts)))):
+        is_blank = separator == " " and len(line.cells) > 1  # it is also within names
+        if not is_blank and any(separator in cell for cell in line.cells):
             raise line.refuse(
                 f"cells are separated by {word}; save the file with commas between them and points"
                 " in numbers"

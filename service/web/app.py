@@ -25,6 +25,7 @@ from service.twin.runtime.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter
+from service.web.auth.dependencies import require_unique_keys
 from service.web.auth.fair_limiter import FairLimiter
 from service.web.auth.queries import require_known_query
 from service.web.middleware import (
@@ -79,7 +80,9 @@ def require_fit(settings: Settings, database: Database) -> None:
 def collect_routes(kinds: Kinds) -> list[BaseRoute]:
     """Collect the routes of the API, the pages and the paths next to them."""
     root = APIRouter(generate_unique_id_function=_operation_id)
-    v1 = APIRouter(prefix="/v1", dependencies=[Depends(require_known_query)])
+    v1 = APIRouter(
+        prefix="/v1", dependencies=[Depends(require_known_query), Depends(require_unique_keys)]
+    )
     v1.include_router(
         jobs.creators(kinds)
     )  # before the routes of a job, which would read the names of kinds as numbers

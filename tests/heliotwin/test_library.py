@@ -60,7 +60,9 @@ def test_results_have_short_words_plots_and_tables():
     flux = heliotwin.Flux(light, (6.0, 4.0), 2e3, 48e3, None, None, (200.0, 45.0))
     photograph = heliotwin.Photograph("101", "main", (200.0, 45.0), NOON, None, light)
     compared = heliotwin.Comparison(photograph, light, 0.9, 4.0, True)
-    for one in (surface, flux, photograph, compared):
+    assert repr(surface) == "Surface(AB12, given, 4 facets)"
+    assert repr(flux) == "Flux(6 x 4 m, peak 2 kW/m2, power 48 kW, sun 200.0, 45.0 deg)"
+    for one in (photograph, compared):
         assert len(repr(one)) < 240
         assert "array" not in repr(one)
     table = heliotwin.to_frame([compared, compared])

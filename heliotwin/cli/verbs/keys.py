@@ -1,7 +1,7 @@
 """The commands ``heliotwin keys ...``."""
 
 import json
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Annotated
 
 import typer
@@ -79,14 +79,14 @@ def list_(as_json: AsJson = False) -> None:
         typer.echo(
             json.dumps(
                 [{field: getattr(row, field) for field in fields} for row in rows],
-                default=str,
+                default=datetime.isoformat,
                 indent=1,
             )
         )
         return
-    table = Table("name", "role", "prefix", "state", "made", "expires", "last used", "withdrawn")
+    table = Table("name", "role", "prefix", "state", "expires", "last used")  # of 80 columns
     for row in rows:
-        times = [getattr(row, field) for field in _TIMES]
+        times = (row.expires_at, row.last_used_at)
         shown = ["" if at is None else f"{at:%Y-%m-%d %H:%M}" for at in times]
         table.add_row(row.name, row.role, row.prefix, row.state, *shown)
     Console().print(table)

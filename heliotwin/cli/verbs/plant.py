@@ -106,6 +106,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Make a plant of another program's file; notes say what the file leaves open."""
+    from service.base.names import counted
     from service.sources.plant_formats.formats import import_plant
 
     require_folder(out)
@@ -119,7 +120,7 @@ def import_(
     if as_json:
         typer.echo(json.dumps(report, indent=1))
         return
-    typer.echo("\n".join([*imported.notes, f"{count:,} heliostats in {written[0]}"]))
+    typer.echo("\n".join([*imported.notes, f"{counted(count, 'heliostat')} in {written[0]}"]))
 
 
 @app.command()

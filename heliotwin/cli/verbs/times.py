@@ -25,6 +25,7 @@ def times(
     as_json: AsJson = False,
 ) -> None:
     """Set the times of stored measurements, all or none; each is stored as a correction."""
+    from service.base.names import counted
     from service.sources.files import require_regular
     from service.twin.photographs.batches import TIMES, correct_many
     from service.twin.photographs.times import read_times
@@ -35,4 +36,4 @@ def times(
     with open_runtime() as runtime:
         changed = correct_many(runtime, given, reason, actor(), TIMES)
     report = {"given": len(given), "changed": changed}
-    typer.echo(json.dumps(report) if as_json else f"{len(given)} times, {changed} of them new")
+    typer.echo(json.dumps(report) if as_json else f"{counted(len(given), 'time')}, {changed} new")

@@ -151,6 +151,8 @@
   const options = (place, data, showZoom) => {
     const axis = { stroke: () => css("--soft"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { stroke: () => css("--edge"), width: 1, size: 5 } };
     const group = data.span.join();
+    // Above the values the legend has its space, but no accuracy is above 100 %.
+    const below = (u, splits) => splits.map((value) => (data.unit === "%" && value > 100 ? null : value));
     const isWhole = (min, max) => min <= data.span[0] && max >= data.span[1];
     // All timelines with the same times zoom together, also by keyboard.
     const share = (u, key) => {
@@ -170,7 +172,7 @@
       },
       axes: [
         { ...axis, space: 90, values: (u, splits, place, space, step) => timeLabels(data.zone, splits, step) },
-        { ...axis, values: (u, splits) => splits.map((value) => String(value)), size: (u, labels) => 16 + 7.5 * Math.max(3, ...(labels ?? []).map((label) => label.length)) },
+        { ...axis, filter: below, grid: { ...axis.grid, filter: below }, ticks: { ...axis.ticks, filter: below }, values: (u, splits) => splits.map((value) => (value == null ? "" : String(value))), size: (u, labels) => 16 + 7.5 * Math.max(3, ...(labels ?? []).map((label) => label.length)) },
       ],
       series: [
         { label: "Time", value: (u, at) => (at == null ? "" : clock(data.zone, at)) },

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from service.base.names import NAME, require_name
+from service.base.names import NAME, counted, require_name
 from service.sources.folder import MeasuredSurface
 from service.sources.hdf5 import Hdf5Group, open_hdf5
 from service.sources.plant_formats.artist_axes import TILTS, TRANSLATIONS, RigidBody, rigid_body
@@ -149,8 +149,8 @@ class _Scenario:
             )
         if surfaces:
             self.notes.append(
-                f"surfaces: {len(surfaces)} heliostats have measured ones, in H/Deflectometry;"
-                " heliotwin field takes them with --surfaces and this folder."
+                f"surfaces: measured ones of {counted(len(surfaces), 'heliostat')}, in"
+                " H/Deflectometry; heliotwin field takes them with --surfaces and this folder."
             )
             self.notes.append(
                 "surfaces: read as fits of deflectometry, a parameter is a position; without"

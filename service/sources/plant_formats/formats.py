@@ -18,7 +18,7 @@ from service.sources.plant_formats.imported import ImportedPlant
 from service.sources.plant_formats.opencsp import COLUMNS, read_opencsp
 from service.sources.plant_formats.positions import has_positions, read_positions
 from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
-from service.sources.plant_formats.soltrace import read_soltrace
+from service.sources.plant_formats.soltrace import is_soltrace, read_soltrace
 from service.sources.plant_formats.soltrace_export import soltrace_text
 from service.sources.text_lines import read_csv
 
@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 
 
 def read_foreign(path: Path, parameters_are_positions: bool = False) -> ImportedPlant:
-    """Read a file of SolTrace (``.stinput``), ARTIST (``.h5``), or a CSV by its first line:
-    OpenCSP, SolarPILOT, or positions.
+    """Read a file of SolTrace (``.stinput``, or by its first line), ARTIST (``.h5``), or a CSV by
+    its first line: OpenCSP, SolarPILOT, or positions.
 
     ``parameters_are_positions`` says how ARTIST's splines are read, as of `model.surface.heights`.
 
@@ -36,7 +36,7 @@ def read_foreign(path: Path, parameters_are_positions: bool = False) -> Imported
     InvalidInputError
         It names file and line of what is not understood.
     """
-    if path.suffix.lower() == ".stinput":
+    if path.suffix.lower() == ".stinput" or is_soltrace(path):
         return read_soltrace(path)
     if path.suffix.lower() in (".h5", ".hdf5"):
         return read_artist(path, parameters_are_positions)

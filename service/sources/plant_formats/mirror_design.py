@@ -44,6 +44,12 @@ class FacetedMirror:
         """Unit normals (F, 3)."""
         return facet_axes(self.sides)[:, 2]
 
+    @property
+    def turned(self) -> float:
+        """The largest angle [rad] of a facet's side x in the mirror's plane."""
+        sides = self.sides[:, 0]
+        return float(np.abs(np.arctan2(sides[:, 1], sides[:, 0])).max())
+
 
 def facet_axes(sides: Array) -> Array:
     """Axes (F, 3 axes, 3) of facets with half sides (F, 2, 3)."""

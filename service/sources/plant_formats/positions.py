@@ -46,6 +46,9 @@ def read_positions(path: Path) -> ImportedPlant:
         columns = {key: index for index, key in enumerate(("east", "north", "up"))}
         lines = [first, *lines]
         require_no_count(lines, "id,x,y")
+    for cell in first.cells:
+        if first.is_words and first.cells.count(cell) > 1:
+            raise first.refuse(f"column {cell[:60]!r} is there twice; keep one")
     unknown = [cell for index, cell in enumerate(first.cells) if index not in columns.values()]
     if unknown:
         raise first.refuse(

@@ -3,7 +3,7 @@
 A layout has no column names: template, since 2018 whether it is enabled and in the layout, x, y, z,
 then optionally two focal lengths, a canting vector and an aim point, ``NULL`` where SolarPILOT
 computes them. The layout that its program exports has column names, a line of units below, and a
-comma at the end of each line. Results have column names.
+comma at the end of each line. Results have column names, below the sun if the program wrote them.
 
 Source: NREL, SolarPILOT, ``interop::UpdateMapLayoutData`` and its help on field layouts; sample
 results of NREL/HALOS.
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
+from service.base.names import counted
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.imported import (
     ImportedPlant,
@@ -28,15 +29,17 @@ from service.sources.plant_formats.imported import (
     site,
 )
 from service.sources.plant_schema import MAX_HELIOSTATS, HeliostatEntry
-from service.sources.text_lines import ForeignLine, read_csv
+from service.sources.text_lines import ForeignLine, read_csv, require_commas, to_number
 
 Array = NDArray[np.float64]
 
 _POSITION = ("Pos-x", "Pos-y", "Pos-z")
 _AIM = ("Aim-x", "Aim-y", "Aim-z")
 _OPTICS = ("Reflectivity", "Soiling")
-_EXPORT = ("Template", "In layout", "Enabled", "Loc. X", "Loc. Y", "Loc. Z")
+_EXPORT, _FLAG = ("Loc. X", "Loc. Y", "Loc. Z"), "In layout"
 _WIDTHS = (4, 6, 9, 12)
+# Most lines above the columns of results: the program writes sun and DNI there.
+_MOST_TITLES = 12
 _NULL = "NULL"
 _MAX_TYPES = 64
 REFLECTANCE = 0.9
@@ -64,46 +67,56 @@ def read_solarpilot(path: Path) -> ImportedPlant:
     lines = read_csv(path, MAX_HELIOSTATS)
     if not lines:
         raise InvalidInputError(f"{path}: is empty")
-    if "Pos-x" in lines[0].cells:
-        return _results(path, lines)
-    head = tuple(lines[0].cells[:6])
-    if head == _EXPORT:
+    results = [n for n, line in enumerate(lines[:_MOST_TITLES]) if "Pos-x" in ",".join(line.cells)]
+    if results:
+        require_commas(lines[results[0]])
+        return _results(path, lines[: results[0]], lines[results[0] :])
+    if lines[0].cells[0] == "Template" and {*_EXPORT} <= {*lines[0].cells}:
         units = [line for line in lines[1:2] if "[m]" in line.cells]
-        return _layout(path, lines[1 + len(units) :], has_flags=True)
+        return _layout(path, lines[1 + len(units) :], _FLAG in lines[0].cells)
     if lines[0].is_words:
         raise lines[0].refuse(
             "columns are not understood; name them x,y or x,y,z for positions, with id and type"
             " if you like"
         )
-    flags = {cell for line in lines for cell in line.cells[1:3]}
-    has_flags = len(lines[0].cells) in [width + 2 for width in _WIDTHS] and flags <= {"0", "1"}
+    flags = {to_number(cell) for line in lines for cell in line.cells[1:3]}
+    has_flags = len(lines[0].cells) in [width + 2 for width in _WIDTHS] and flags <= {0, 1}
     if not has_flags:
         require_no_count(lines, "id,x,y,z")
     return _layout(path, lines, has_flags)
 
 
 def require_no_count(lines: Sequence[ForeignLine], names: str) -> None:
-    """Refuse lines without column names whose first cell counts them, as an identifier does."""
-    counted = [str(number + int(lines[0].cells[0] == "1")) for number in range(len(lines))]
-    if len(lines) > 2 and [line.cells[0] for line in lines] == counted:
+    """Refuse lines without column names whose first cell counts them, as an identifier does.
+
+    Two lines of a layout may be of two templates.
+    """
+    start = int(lines[0].cells[0]) if lines[0].cells[0].isdecimal() else -1
+    counted = [str(start + number) for number in range(len(lines))]
+    if len(lines) > 1 + (len(lines[0].cells) > 3) and [line.cells[0] for line in lines] == counted:
         raise lines[0].refuse(
             f"the first cells count the lines; put the names of columns above, such as {names}"
         )
 
 
-def _results(path: Path, lines: Sequence[ForeignLine]) -> ImportedPlant:
+def _results(
+    path: Path, titles: Sequence[ForeignLine], lines: Sequence[ForeignLine]
+) -> ImportedPlant:
     head = list(lines[0].cells)
     for name in ("Heliostat ID", *_POSITION, *_AIM):
         if name not in head:
             raise lines[0].refuse(f"column {name} is missing")
+    if len(lines) == 1:
+        raise lines[0].refuse("no heliostat follows")
     require_unique(lines[1:], head.index("Heliostat ID"))
     heliostats: list[HeliostatEntry] = []
     aims: dict[str, Array] = {}
     types: dict[float, str] = {}
+    assumed = 1.0 if _OPTICS[0] in head else REFLECTANCE
     for line in lines[1:]:
         name = f"H{int(line.number(head.index('Heliostat ID'), 0, 1e9))}"
         shares = [line.number(head.index(key), 0, 1) for key in _OPTICS if key in head]
-        reflectance = round(math.prod(shares), 6) if shares else REFLECTANCE
+        reflectance = round(math.prod(shares) * assumed, 6)
         kind = types.setdefault(reflectance, f"T{len(types)}")
         if len(types) > _MAX_TYPES:
             raise line.refuse(
@@ -116,7 +129,11 @@ def _results(path: Path, lines: Sequence[ForeignLine]) -> ImportedPlant:
     left_out = [key for key in head if key not in ("Heliostat ID", *_POSITION, *_AIM, *known)]
     notes = []
     if known:
-        notes.append(f"reflectance: {' times '.join(known)}, of the file.")
+        factors = [*([f"{assumed:g}"] if assumed != 1 else []), *known]
+        notes.append(f"reflectance: {' times '.join(factors)}, of the file.")
+    if titles:
+        above = "; ".join(" ".join(line.cells)[:60] for line in titles)
+        notes.append(f"lines above the columns that are left out: {above}.")
     if left_out:
         notes.append(f"columns that are left out: {', '.join(key[:40] for key in left_out)}.")
     kinds = {kind: reflectance for reflectance, kind in types.items()}
@@ -134,7 +151,7 @@ def _layout(path: Path, lines: Sequence[ForeignLine], has_flags: bool) -> Import
             if n_on != 1:
                 n_off += 1
                 continue
-        cells = line.cells
+        cells = [cell.upper() for cell in line.cells]
         if len(cells) not in _WIDTHS:
             raise line.refuse(
                 f"has {len(cells) + 2 * has_flags} cells; a layout has"
@@ -152,7 +169,7 @@ def _layout(path: Path, lines: Sequence[ForeignLine], has_flags: bool) -> Import
             aims[f"H{number}"] = np.array(line.numbers(9, 3))
     if not heliostats:
         raise InvalidInputError(f"{path}: has no heliostat that is enabled and in the layout")
-    off = f"{n_off} heliostats that are not enabled or not in the layout are left out."
+    off = f"left out, as not enabled or not in the layout: {counted(n_off, 'heliostat')}."
     kinds = {entry.type: REFLECTANCE for entry in heliostats}
     return default_plant(path, heliostats, aims, kinds, [off] if n_off else [])
 

@@ -7,6 +7,7 @@ Source: NREL, SolTrace, input files of version 2012.7.6; Wendelin, *SolTRACE: a 
 tool for concentrating solar optics*, ISEC 2003, doi:10.1115/ISEC2003-44090.
 """
 
+import codecs
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,12 +19,14 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.base.names import NAME
-from service.sources.files import file_name, read_text
+from service.base.names import NAME, counted
+from service.sources.files import file_name, read_text, require_regular
 from service.sources.plant_formats.imported import ImportedPlant, placed, site
 from service.sources.plant_formats.mirror_design import FacetedMirror, MirrorDesign, design_of
 from service.sources.plant_formats.soltrace_mirrors import (
+    NAMED_STAGE,
     SOLTRACE_TOLERANCE,
+    TURNED,
     Element,
     Pose,
     heliostat_groups,
@@ -51,7 +54,9 @@ class OpticalPair:
 
 @dataclass(frozen=True, eq=False)
 class SolTraceInput:
-    """An input file: unit vector to the sun (3,), its shape, optics by name, elements by stage."""
+    """An input file: unit vector to the sun (3,), its shape, optics by name, elements by stage,
+    and whether comments are names of heliostats.
+    """
 
     sun: Array
     sun_shape: str
@@ -59,6 +64,7 @@ class SolTraceInput:
     sun_table: Array
     optics: Mapping[str, OpticalPair]
     stages: Sequence[Sequence[Element]] = field(default_factory=tuple)
+    has_names: bool = False
 
 
 def euler_axes(direction: Array, z_rotation_deg: float) -> Array:
@@ -79,6 +85,13 @@ def euler_axes(direction: Array, z_rotation_deg: float) -> Array:
 
 # --- the file
 # --------------------------------------------------------------------------------------------------
+
+
+def is_soltrace(path: Path) -> bool:
+    """Whether a file begins as an input of SolTrace does; SolarPILOT may name it ``.txt``."""
+    with require_regular(path).open("rb") as file:
+        start = file.read(16).removeprefix(codecs.BOM_UTF8)
+    return start.startswith((b"# SOLTRACE", b"SUN\tPTSRC"))
 
 
 def parse_soltrace(path: Path) -> SolTraceInput:
@@ -103,14 +116,18 @@ def _parse(lines: Iterator[ForeignLine]) -> SolTraceInput:
         sun = next(lines)
     elif sun.cells[0] != "SUN":
         raise sun.refuse("must begin with # SOLTRACE or SUN; it is no input file of SolTrace")
-    position, table = next(lines), next(lines)
+    position = next(lines)
     if sun.cells[:2] != ["SUN", "PTSRC"] or position.cells[0] != "XYZ":
         raise sun.refuse("must be the sun, SUN PTSRC, and its position below")
     if sun.number(2, 0, 1) != 0:
         raise sun.refuse("a point source, PTSRC 1, is no sun; write PTSRC 0 and the sun's position")
     if position.cells[4:6] != ["USELDH", "0"]:
         raise position.refuse("a sun by latitude, day and hour is not read; give its position")
-    points = [next(lines).numbers(0, 2) for _ in range(int(table.number(1, 0, 1e4)))]
+    table = next(lines)
+    points: list[list[float]] = []
+    if table.cells[0] == "USER SHAPE DATA":  # SolarPILOT writes it for sun shape d only
+        points = [next(lines).numbers(0, 2) for _ in range(int(table.number(1, 0, 1e4)))]
+        table = next(lines)
     shape = sun.cells[4].lower() if len(sun.cells) > 4 else ""
     if shape not in ("p", "g", "d"):
         raise sun.refuse(f"sun shape {shape[:20]!r} is none of p, g, d")
@@ -123,8 +140,8 @@ def _parse(lines: Iterator[ForeignLine]) -> SolTraceInput:
         shape,
         size,
         np.array(points).reshape(-1, 2),
-        _optics(lines),
-        _stages(lines),
+        _optics(table, lines),
+        *_stages(lines),
     )
 
 
@@ -134,9 +151,9 @@ def _count(line: ForeignLine, title: str) -> int:
     return int(line.number(1, 0, 1e6))
 
 
-def _optics(lines: Iterator[ForeignLine]) -> dict[str, OpticalPair]:
+def _optics(head: ForeignLine, lines: Iterator[ForeignLine]) -> dict[str, OpticalPair]:
     pairs = {}
-    for _ in range(_count(next(lines), "OPTICS LIST COUNT")):
+    for _ in range(_count(head, "OPTICS LIST COUNT")):
         name = next(lines)
         if name.cells[0] != "OPTICAL PAIR" or len(name.cells) < 2:
             raise name.refuse("must be an OPTICAL PAIR with its front and back")
@@ -168,23 +185,38 @@ def _surface_optics(lines: Iterator[ForeignLine]) -> OpticalPair:
     )
 
 
-def _stages(lines: Iterator[ForeignLine]) -> list[list[Element]]:
-    stages = []
+class _Stages(NamedTuple):
+    """Elements by stage, and whether the first stage's comments are names of heliostats."""
+
+    elements: list[list[Element]]
+    has_names: bool
+
+
+def _stages(lines: Iterator[ForeignLine]) -> _Stages:
+    stages, titles = [], []
     for _ in range(_count(next(lines), "STAGE LIST COUNT")):
         head = next(lines)
-        here = [*head.cells[1:5], *head.cells[5:9], *head.cells[9:11]]
         if head.cells[0] != "STAGE" or "ELEMENTS" not in head.cells:
             raise head.refuse("must be a STAGE with its number of ELEMENTS")
-        if here != ["XYZ", "0", "0", "0", "AIM", "0", "0", "1", "ZROT", "0"]:
+        if not _is_at_origin(head):
             raise head.refuse(
                 "a stage with an origin or a direction of its coordinates is not read"
             )
-        next(lines)  # its name
+        title = next(lines).cells[0]
         count = int(head.number(head.cells.index("ELEMENTS") + 1, 0, 1e6))
         elements = [_element(next(lines)) for _ in range(count)]
         if head.cells[11:13] != ["VIRTUAL", "1"]:
             stages.append(elements)
-    return stages
+            titles.append(title)
+    return _Stages(stages, titles[:1] == [NAMED_STAGE])
+
+
+def _is_at_origin(stage: ForeignLine) -> bool:
+    """Whether a stage has the coordinates of the whole; other programs write 0.000000 for 0."""
+    if (stage.cells[1], stage.cells[5], stage.cells[9]) != ("XYZ", "AIM", "ZROT"):
+        return False
+    *others, up, turn = *stage.numbers(2, 3), *stage.numbers(6, 3), stage.number(10)
+    return not any(others) and up > 0 and turn == 0
 
 
 def _element(line: ForeignLine) -> Element:
@@ -227,7 +259,7 @@ def read_soltrace(path: Path) -> ImportedPlant:
         raise InvalidInputError(
             f"{file_name(path)}: must have a stage of heliostats and one of receivers"
         )
-    groups = heliostat_groups(stages[0])
+    groups = heliostat_groups(stages[0], given.has_names)
     if len(groups) > MAX_HELIOSTATS:
         raise stages[0][-1].line.refuse(f"at most {MAX_HELIOSTATS} heliostats are read")
     receivers = _receivers(stages[1], given.optics)
@@ -235,8 +267,10 @@ def read_soltrace(path: Path) -> ImportedPlant:
     heliostats: list[HeliostatEntry] = []
     poses: list[Pose] = []
     known: list[FacetedMirror] = []
+    turned = 0.0
     for name, facets in groups.items():
         pose, own = posed_mirror(facets)
+        turned = max(turned, own.turned)
         mirror = like_known(own, known)
         design, focal_length = design_of(mirror, SOLTRACE_TOLERANCE)
         optics = {facet.optics for facet in facets}
@@ -279,17 +313,27 @@ def read_soltrace(path: Path) -> ImportedPlant:
             " middle; change their mounts to yours.",
             "pointing_error_mrad is SolTrace's specularity error: both spread the beam alike.",
             *(
-                [f"heliostats: {len(stages[0])} facets are {len(groups)} heliostats."]
+                [f"heliostats: {len(stages[0])} facets are {counted(len(groups), 'heliostat')}."]
                 if len(groups) < len(stages[0])
                 else []
             ),
-            *([f"{n_off} elements are switched off, and left out."] if n_off else []),
+            *_turn_notes(turned),
+            *([f"left out, as switched off: {counted(n_off, 'element')}."] if n_off else []),
             *(
                 ("sun: a pillbox of the same spread replaces the file's table.",)
                 * (given.sun_shape == "d")
             ),
         ),
     )
+
+
+def _turn_notes(turned: float) -> list[str]:
+    if turned < TURNED:
+        return []
+    return [
+        f"facets: turns of up to {1e3 * turned:.3g} mrad in the mirror's plane are left out; they"
+        " come from the facets' canting."
+    ]
 
 
 def _facets_file(kind: str) -> str:

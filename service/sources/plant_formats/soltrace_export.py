@@ -18,6 +18,7 @@ from model.plant import Cylinder, Facet, TargetPlane
 from model.receivers import Panels
 from model.sunshape import SOLAR_DISC, Gaussian, Pillbox, SunShape
 from service.sources.plant_file import PlantDescription
+from service.sources.plant_formats.soltrace_mirrors import NAMED_STAGE
 from service.sources.plant_receivers import AnyReceiver
 from service.sources.plant_schema import UP
 
@@ -55,7 +56,7 @@ def soltrace_text(
         *_optics_lines(described),
         "STAGE LIST COUNT\t2",
         _STAGE.format(len(mirrors)),
-        "Heliostat field",
+        NAMED_STAGE,
         *mirrors,
         _STAGE.format(len(receivers)),
         "Receiver",

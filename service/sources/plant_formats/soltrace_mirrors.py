@@ -26,12 +26,19 @@ SOLTRACE_TOLERANCE = Tolerance(slope=5e-5, power=2e-2)
 _SAME_PLACE = 2e-2  # [m], of facets in their mirror
 _SAME_SIZE = 2e-3  # [m]
 _ROLL = 1e-4  # largest deviation of a mirror's x axis from the horizontal [rad]
-_TURNED = 1e-3  # [rad], of a facet's side in its mirror
+TURNED = 1e-3
+"""Angle [rad] of a facet's side in its mirror that is not worth a word."""
+# Programs give canted facets the rotation of their mirror. It turns them by their canting times the
+# tangent of the normal's angle from the horizontal plane through x and z.
+_TURNED_BY_CANTING = 3.0
 _CANTED = 0.3  # largest angle between the normals of facets of one heliostat [rad]
 # Heliostats turn freely: their middles are further apart than they are large.
 _FREE = 0.97
 # Largest gap between neighbouring facets, in their shorter side.
 _GAP = 0.25
+
+NAMED_STAGE = "Heliostat field, comments are names"
+"""The name of a stage whose elements have their heliostat's name as comment, as we write it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +84,12 @@ class Pose(NamedTuple):
 # --------------------------------------------------------------------------------------------------
 
 
-def heliostat_groups(elements: Sequence[Element]) -> dict[str, list[Element]]:
+def heliostat_groups(
+    elements: Sequence[Element], has_names: bool = False
+) -> dict[str, list[Element]]:
     """Elements by heliostat: those of one comment, or those that touch.
+
+    Comments that differ within elements that touch name facets, unless ``has_names``.
 
     Raises
     ------
@@ -88,15 +99,17 @@ def heliostat_groups(elements: Sequence[Element]) -> dict[str, list[Element]]:
     by_comment: dict[str, list[Element]] = {}
     for element in elements:
         by_comment.setdefault(element.comment, []).append(element)
-    if "" not in by_comment and all(map(_is_one_mirror, by_comment.values())):
-        names = list(by_comment)
-        if not all(re.fullmatch(NAME, name) for name in names):
-            names = [f"H{number}" for number in range(1, len(names) + 1)]
-        return dict(zip(names, by_comment.values(), strict=True))
     by_label: dict[int, list[Element]] = {}
     for element, label in zip(elements, _touching(elements).tolist(), strict=True):
         by_label.setdefault(label, []).append(element)
     groups = list(by_label.values())
+    are_facets = any(len({element.comment for element in group}) > 1 for group in groups)
+    are_names = has_names or not are_facets or not all(map(_is_one_mirror, groups))
+    if "" not in by_comment and are_names and all(map(_is_one_mirror, by_comment.values())):
+        names = list(by_comment)
+        if not all(re.fullmatch(NAME, name) for name in names):
+            names = [f"H{number}" for number in range(1, len(names) + 1)]
+        return dict(zip(names, by_comment.values(), strict=True))
     for group in groups:
         if not _is_one_mirror(group):
             raise group[1].line.refuse(
@@ -250,8 +263,8 @@ def _faceted_mirror(facets: Sequence[Element], pose: Pose) -> FacetedMirror:
         local: Array = facet.axes @ pose.axes.T
         if abs(local[0, 1]) > abs(local[0, 0]):
             half, local = half[::-1], np.stack([-local[1], local[0], local[2]])
-        # A facet that is canted about both axes is turned by the product of the angles.
-        limit = _ROLL if len(facets) == 1 else _TURNED + abs(local[2, 0] * local[2, 1])
+        canting = float(np.hypot(*local[2, :2]))
+        limit = _ROLL if len(facets) == 1 else TURNED + _TURNED_BY_CANTING * canting
         if abs(local[0, 1]) > limit:
             raise facet.line.refuse(
                 "is rolled about its normal; only mirrors on an azimuth-elevation mount are read"

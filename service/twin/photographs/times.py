@@ -1,6 +1,5 @@
 """Times and motor positions of many photographs, given afterwards as lines, or by an offset."""
 
-import csv
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -12,6 +11,7 @@ from sqlalchemy.orm import Session
 from model.errors import InvalidInputError
 from service.base.fields import Moment, read_time
 from service.base.validation_messages import format_validation_error
+from service.sources.text_lines import ForeignLine, csv_lines
 from service.store.photographs.groups import PhotographFilter, list_groups
 from service.twin.photographs.batches import MOST_ENTRIES
 from service.twin.photographs.corrections import GivenCorrection
@@ -65,26 +65,29 @@ def _read(
     columns: tuple[str, ...],
     correction: Callable[[dict[str, str]], GivenCorrection],
 ) -> list[GivenCorrection]:
-    text = [line for line in lines if line.strip()]
-    names = [name.strip() for name in text[0].split(",")] if text else list(columns)
-    has_no_heading = len(names) == len(columns) and names[-1].lstrip("-")[:1].isdigit()
-    if not {*columns} <= {*names} and not has_no_heading:
+    text = "\n".join(line.rstrip("\r\n") for line in lines)
+    first, *rows = [*csv_lines(where, text)] or [ForeignLine(where, columns)]
+    names = first.cells
+    if len(names) == len(columns) and names[-1].lstrip("-")[:1].isdigit():  # there is no heading
+        names, rows = columns, [first, *rows]
+    if not {*columns} <= {*names}:
         raise InvalidInputError(
             f"{where}: needs the columns {', '.join(columns)} in its first line"
         )
     found = []
-    reader = csv.DictReader(text, columns if has_no_heading else None, skipinitialspace=True)
-    for row in reader:
+    for line in rows:
+        if len(line.cells) != len(names):
+            raise line.refuse(f"has {len(line.cells)} cells, {len(names)} are the columns")
+        row = dict(zip(names, line.cells, strict=True))
         try:
-            given = {name: value or "" for name, value in row.items() if name in columns}
-            found.append(correction(given))
+            found.append(correction(row))
         except (ValidationError, InvalidInputError) as error:
             said = (
                 format_validation_error(error, columns[-1])
                 if isinstance(error, ValidationError)
                 else str(error)
             )
-            raise InvalidInputError(f"{where}, line {reader.line_num}: {said}") from None
+            raise line.refuse(said) from None
     if not found:
         raise InvalidInputError(f"{where}: holds no {'time' if 'taken_at' in columns else 'motor'}")
     return found

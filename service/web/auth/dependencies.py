@@ -5,6 +5,7 @@ returns. A session from a dependency would keep its connection while the request
 and other threads would wait for that connection.
 """
 
+import json
 import re
 import threading
 from collections.abc import AsyncIterator
@@ -15,7 +16,7 @@ from fastapi import Depends, Header, Path, Query, Request, Response
 
 from model.errors import InvalidInputError
 from service.base.errors import UnsupportedContentError
-from service.base.fields import MeasurementName, Name, Reason
+from service.base.fields import MeasurementName, Name, Reason, unique_keys
 from service.jobs.kind import Kinds
 from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.forecasts.aim_sources import plant_time_zone
@@ -196,21 +197,44 @@ def _content_type(request: Request) -> str:
 
 async def require_json(request: Request) -> None:
     """Refuse a body that is not JSON."""
-    media_type = _content_type(request)
-    if media_type != "application/json" and not (
-        media_type.startswith("application/") and media_type.endswith("+json")
-    ):
+    if not _is_json(request):
         raise UnsupportedContentError("Content-Type: send the body as application/json")
 
 
+def _is_json(request: Request) -> bool:
+    media_type = _content_type(request)
+    return media_type == "application/json" or (
+        media_type.startswith("application/") and media_type.endswith("+json")
+    )
+
+
+async def require_unique_keys(request: Request) -> None:
+    """Refuse a JSON body that has a key twice in an object."""
+    if not _is_json(request):
+        return
+    try:
+        json.loads(await request.body(), object_pairs_hook=unique_keys)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        pass  # it is refused where it is read
+    except ValueError as error:
+        raise InvalidInputError(f"body: {error}") from None
+
+
 async def require_multipart(request: Request) -> None:
-    """Refuse a body that is not a form with files, or has a field twice other than ``files``."""
+    """Refuse a body that is not a form with files, has a field twice other than ``files``, or one
+    that its path does not know.
+    """
     if _content_type(request) != "multipart/form-data":
         raise UnsupportedContentError(
             "Content-Type: send the file and its fields as multipart/form-data"
         )
     names = [name for name, _ in (await request.form()).multi_items()]
+    route = request.scope["route"]
+    known = [parameter.alias for parameter in route.dependant.body_params]
     for name in names:
+        if route.include_in_schema and name not in known:
+            listed = ", ".join(known)
+            raise InvalidInputError(f"{name[:60]}: is not a part of this form; known are {listed}")
         if name != "files" and names.count(name) > 1:
             raise InvalidInputError(f"{name[:60]}: is there twice; send it once")
 

@@ -25,6 +25,7 @@ from model.fleet import LOSSES
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
 from service.base.fields import Rows, State, Version
+from service.base.names import KEY
 from service.drawing.charts import HeatMap
 from service.drawing.pictures import flux_picture
 from service.drawing.templates import in_zone
@@ -152,7 +153,7 @@ IdempotencyKey = Annotated[
     str | None,
     Header(
         alias="Idempotency-Key",
-        pattern=r"^[\x21-\x7e]{1,128}$",
+        pattern=KEY,
         description=(
             "Any text of the sender's own: the same request with the same key is the same job,"
             " and its second answer has the header `Idempotency-Replayed`."

@@ -396,7 +396,7 @@ def _read_metadata(part: Any, refuse: Callable[[Any], MeasurementIn]) -> Measure
     text = (
         part.file.read(_MAX_METADATA + 1).removeprefix(BOM_UTF8)
         if isinstance(part, UploadFile | StarletteUploadFile)
-        else part
+        else part.removeprefix("\ufeff")
     )
     try:
         given = json.loads(text, object_pairs_hook=unique_keys)

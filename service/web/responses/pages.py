@@ -22,6 +22,7 @@ from starlette.types import Scope
 
 from service.base.arrays import pack
 from service.base.errors import NotFoundError
+from service.base.names import counted
 from service.drawing.charts import Figure
 from service.drawing.templates import ASSETS, environment, form_time, moment, times_in_zone
 from service.jobs.enqueuing import enqueue
@@ -173,6 +174,7 @@ def _environment() -> Environment:
     made.globals.update(plant_zone=_zone)
     made.filters.update(
         shown=_shown,
+        counted=counted,
         linked=_linked,
         plant_times=lambda text: times_in_zone(str(text), _zone()),
         moment=_moment,

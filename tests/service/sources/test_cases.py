@@ -86,7 +86,7 @@ def test_a_layout_that_solarpilots_program_exports_is_read():
     imported = read_foreign(case("solarpilot-gui-export/layout-export.csv"))
     assert places(imported) == [(-20, 80, 0), (20, 80, 0)]
     np.testing.assert_allclose(imported.aims["H2"], [0, 4, 60])
-    assert any("1 heliostats that are not enabled" in note for note in imported.notes)
+    assert any("not in the layout: 1 heliostat." in note for note in imported.notes)
 
 
 def test_reflectivity_and_soiling_are_read():

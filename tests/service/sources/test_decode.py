@@ -209,6 +209,19 @@ def test_a_tiff_that_readers_read_differently_is_refused(data, refusal):
         decode_image(data)
 
 
+@pytest.mark.parametrize(("kind", "is_read"), [(0, False), (2, False), (1, True)])
+def test_only_a_preview_may_follow_the_picture_of_a_tiff(kind, is_read):
+    buffer = io.BytesIO()
+    second = Image.new("L", (10, 8), 200)
+    second.encoderinfo = {"tiffinfo": {254: kind}}
+    Image.new("L", (60, 40), 50).save(buffer, "TIFF", save_all=True, append_images=[second])
+    if is_read:
+        assert decode_image(buffer.getvalue()).shape == (40, 60)
+    else:
+        with pytest.raises(InvalidInputError, match="of several pages"):
+            decode_image(buffer.getvalue())
+
+
 @pytest.mark.parametrize("count", [500, 1000])
 def test_a_tiff_whose_tags_share_a_million_bytes_is_refused_without_reading_them(count):
     entries = [(60000 + tag, 1, 1_000_000, 8) for tag in range(count)]

@@ -373,3 +373,30 @@ def test_all_mistakes_are_named_one_a_line(tmp_path: Path):
     layout = "name,type,east_m,north_m,up_m\nA1,large,0,x,0\nA2,large,0,y,0\n"
     said = _refusal(write_plant(tmp_path / "layout", layout=layout)).split("\n")
     assert [line.partition(": north_m")[0][-6:] for line in said] == ["line 2", "line 3"]
+
+
+def test_mistakes_of_document_and_layout_are_named_at_once(tmp_path: Path):
+    text = PLANT.replace("latitude_deg: 34.86", "latitude_deg: 134.86, colour: red")
+    text = text.replace("width_m: 1.8, height_m: 1.35", "widht_m: 1.8, height_m: -1")
+    layout = "name,type,east_m,north_m,up_m\nA1,large,x,80,0\nA2,large,0,90\nA3,large,1,2,3\n"
+    path = write_plant(tmp_path, text, layout=layout)
+    with pytest.raises(InvalidInputError) as refused:
+        read_plant(path)
+    said = str(refused.value)
+    for part in ("latitude_deg: must be 90 or less", "colour: is not known", "height_m: must be"):
+        assert part in said
+    assert "widht_m: is not known here; did you mean width_m?" in said
+    assert "width_m: is missing" not in said
+    assert said.count("layout.csv, line ") == 2
+    path = write_plant(tmp_path, PLANT, layout=f"{layout}A3,larg,1,2,3\n")
+    with pytest.raises(InvalidInputError) as refused:
+        read_plant(path)
+    lines = [re.search(r"line (\d+): (.{9})", line) for line in str(refused.value).split("\n")]
+    found = [(line[1], line[2]) for line in lines if line]
+    assert found == [
+        ("2", "east_m: m"),
+        ("3", "has 4 cel"),
+        ("5", "name: A3 "),
+        ("5", "A3 is at "),
+        ("5", "type: 'la"),
+    ]

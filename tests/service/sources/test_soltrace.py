@@ -13,6 +13,7 @@ from model.frames import sun_direction
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.formats import foreign_text, import_plant, read_foreign
 from service.sources.plant_formats.soltrace_export import soltrace_text
+from service.sources.plant_formats.soltrace_mirrors import NAMED_STAGE
 from tests.service.sources.plant_files import write_plant
 from tests.service.sources.test_plant_formats import SMALL
 
@@ -222,4 +223,62 @@ def test_a_stage_without_a_name_and_what_is_switched_off(tmp_path: Path):
     file.write_text(text.replace("ELEMENTS\t1", "ELEMENTS\t2", 1))
     imported = read_foreign(file)
     assert len(imported.heliostats) == 1
-    assert any("1 elements are switched off" in note for note in imported.notes)
+    assert any("switched off: 1 element." in note for note in imported.notes)
+
+
+def with_cells(text: str, change: Callable[[int, list[str]], list[str]]) -> str:
+    """A file whose lines of elements of the first stage are changed; they are counted from 0."""
+    lines, number = text.split("\n"), 0
+    for index, line in enumerate(lines):
+        cells = line.split("\t")
+        if len(cells) > 28 and not cells[27].startswith("receiver"):
+            lines[index] = "\t".join(change(number, cells))
+            number += 1
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("title", ["{0}", "facet {1}", "H{0}-{1}", "{2}", "heliostat {0}"])
+def test_comments_of_any_kind_leave_facets_together(tmp_path: Path, title: str):
+    """A heliostat's name, a facet's number or both: six facets of one mirror are one heliostat."""
+
+    def comment(n: int, cells: list[str]) -> list[str]:
+        return [*cells[:29], title.format(n // 6 + 1, n % 6 + 1, n)]
+
+    before = made(tmp_path / "before")
+    text = with_cells(six_digits(exported(before)), comment).replace(NAMED_STAGE, "field")
+    after, _ = returned(text, tmp_path / "after")
+    assert [len(one.facets) for one in after.plant.heliostats.values()] == [6] * 4
+
+
+def test_heliostats_that_touch_return_from_our_export(tmp_path: Path):
+    layout = "".join(f"A{n},one,{3.05 * n},120,0\n" for n in range(4))
+    facets = "{rows: 1, columns: 1, width_m: 3, height_m: 2}"
+    before = made(tmp_path / "before", facets=facets, layout=layout, canting="flat", shape="flat")
+    after, _ = returned(exported(before), tmp_path / "after")
+    assert list(after.plant.heliostats) == ["A0", "A1", "A2", "A3"]
+
+
+def test_canted_facets_with_the_rotation_of_their_mirror_are_read(tmp_path: Path):
+    """As SolarPILOT writes them; their sides are not quite along those of the mirror."""
+    before = made(tmp_path / "before", canting="{focal_length_m: 60}")
+    text = six_digits(exported(before))
+    angles = [float(line.split("\t")[7]) for line in text.split("\n") if line.count("\t") > 28]
+    rotations = np.degrees(np.unwrap(np.radians(angles[:24]).reshape(4, 6))).mean(axis=1)
+    turned = with_cells(text, lambda n, c: [*c[:7], f"{rotations[n // 6]:g}", *c[8:]])
+    file = tmp_path / "turned.stinput"
+    file.write_text(turned)
+    imported = read_foreign(file)
+    assert len(imported.heliostats) == 4
+    assert any("mrad in the mirror's plane are left out" in note for note in imported.notes)
+
+
+def test_programs_write_zeros_titles_and_names_of_files_in_their_way(tmp_path: Path):
+    """soltrace-api writes 0.000000; SolarPILOT leaves out an empty table, and names files .txt."""
+    zeros = SMALL.replace("XYZ\t0\t0\t0\tAIM\t0\t0\t1\tZROT\t0", _ZEROS)
+    file = tmp_path / "small.txt"
+    file.write_text(zeros.replace("USER SHAPE DATA\t0\n", ""))
+    (entry,) = read_foreign(file).heliostats
+    assert entry.focal_length_m == 125
+
+
+_ZEROS = "XYZ\t0.000000\t0.000000\t0.000000\tAIM\t0.000000\t0.000000\t1.000000\tZROT\t0.000000"

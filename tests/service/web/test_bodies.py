@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -60,6 +61,21 @@ def test_json_of_great_depth_is_refused_before_it_is_parsed(refusing: TestClient
     assert answer.status_code == 413
     assert f"{MAX_DEPTH} levels" in answer.json()["detail"]
     assert refusing.put("/v1/plant", content=opening * MAX_DEPTH, headers=JSON).status_code == 422
+
+
+def test_no_json_body_may_have_a_key_twice(refusing: TestClient):
+    paths = refusing.get("/openapi.json").json()["paths"]
+    taking = [
+        (method, path)
+        for path, operations in paths.items()
+        for method, operation in operations.items()
+        if "application/json" in operation.get("requestBody", {}).get("content", {})
+    ]
+    assert len(taking) > 20
+    for method, path in taking:
+        at = re.sub(r"\{[^}]*\}", "1", path)
+        answer = refusing.request(method, at, content='{"a": 1, "a": 2}', headers=JSON)
+        assert answer.json()["detail"] == "body: 'a' is there twice; keep one", (method, path)
 
 
 def test_keys_and_depth_are_counted_over_all_parts():

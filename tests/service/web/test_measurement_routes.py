@@ -257,7 +257,9 @@ def test_body_that_is_no_form(refusing: TestClient, content_type: str):
 def test_form_without_its_parts(refusing: TestClient):
     answer = refusing.post(BASE, files={"other": ("x", b"y")})
     assert answer.status_code == 422
-    assert {error["field"] for error in answer.json()["errors"]} == {"metadata"}
+    assert {error["field"] for error in answer.json()["errors"]} == {"other"}
+    empty = refusing.post(BASE, files={"image": ("x.png", png(1))})
+    assert {error["field"] for error in empty.json()["errors"]} == {"metadata"}
     broken = refusing.post(
         BASE, content=b"nothing", headers={"Content-Type": "multipart/form-data; boundary=b"}
     )
@@ -285,10 +287,27 @@ def test_a_key_of_metadata_that_is_there_twice(client: TestClient, end: str):
     assert "is there twice; keep one" in answer.text
 
 
-def test_metadata_may_begin_with_a_byte_order_mark(client: TestClient):
+@pytest.mark.parametrize("name", ["m.json", None])
+def test_metadata_may_begin_with_a_byte_order_mark(client: TestClient, name: str | None):
     text = b"\xef\xbb\xbf" + json.dumps(metadata()).encode()
-    files = {"image": ("a.png", png(1)), "metadata": ("m.json", text)}
+    files = {"image": ("a.png", png(1)), "metadata": (name, text)}
     assert client.post(BASE, files=files).status_code == 201
+
+
+def test_a_part_that_is_not_known_is_not_dropped(client: TestClient):
+    files = {"image": ("a.png", png(1)), "image2": ("b.png", png(2))}
+    answer = client.post(BASE, files=files, data={"metadata": json.dumps(metadata())})
+    assert answer.status_code == 422
+    assert answer.json()["detail"] == (
+        "image2: is not a part of this form; known are metadata, image"
+    )
+
+
+@pytest.mark.parametrize("when", [20260621, "20260621", "1781000000", "1781000000.5"])
+def test_a_number_is_no_time(client: TestClient, when: object):
+    text = json.dumps(metadata() | {"taken_at": when})
+    answer = client.post(BASE, files={"image": ("a.png", png(1))}, data={"metadata": text})
+    assert answer.json()["detail"] == "taken_at: must be a time such as 2026-06-21T11:36:00Z"
 
 
 # --- at the same time

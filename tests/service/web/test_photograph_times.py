@@ -92,7 +92,7 @@ def test_an_offset_shifts_a_selection(client: TestClient, taken: list[dict[str, 
     form = {"minutes": "-60", "since": "2024-05-02", "until": "2024-05-02", "reason": REASON}
     shifted = client.post(f"{PATH}/shift", data=form, headers=HTML)
     assert "1 would change, " not in shifted.text
-    assert "Store 1 times" in shifted.text
+    assert "Store 1 time<" in shifted.text
     assert "2024-05-02 11:00" in shifted.text
     empty = client.post(f"{PATH}/shift", data=form | {"heliostat": "ZZ99"}, headers=HTML)
     assert empty.status_code == 404
@@ -114,6 +114,10 @@ def test_a_file_and_the_plants_zone(client: TestClient, tower: Any, taken: list[
         ("", "lines: holds no time"),
         ("a,b\n1,2", "needs the columns heliostat, id, taken_at"),
         ("AA39,0,20xx", "lines, line 1: taken_at"),
+        ("AA39;0;2024-05-01T12:00:00", "lines, line 1: cells are separated by semicolons"),
+        ("AA39\t0\t2024-05-01T12:00:00", "lines, line 1: cells are separated by tabs"),
+        ("AA39,0,2024-05-01T12:00:00\n\nAA39,1,2024-05-01T12:00:00,5", "line 3: has 4 cells"),
+        ("AA39,0,1781000000", "lines, line 1: taken_at: must be a time such as"),
         ("AA39,nothing,2024-05-01T12:00:00", "times.0: "),
         ("AA39,0,2999-05-01T12:00:00", "lies ahead of"),
     ],
@@ -123,6 +127,11 @@ def test_wrong_lines_are_named(client: TestClient, taken: Any, lines: str, said:
     assert answer.status_code == 422
     assert said in answer.text
     assert _times(client) == [None] * 3
+
+
+def test_quoted_lines_and_comments_are_read(client: TestClient, taken: Any):
+    lines = '# from the log\n"heliostat","id","taken_at"\n"AA39","0","2024-05-01 12:00:00.5"\n'
+    assert "2024-05-01 12:00 UTC" in _preview(client, lines).text
 
 
 def test_undated_photographs_are_a_group_at_the_end(client: TestClient, post: Post, taken: Any):
@@ -137,7 +146,7 @@ def test_motor_positions_are_previewed_stored_and_undone(client: TestClient, pos
     path = "/v1/heliostats/AA39/measurements/1"
     form = {"lines": "AA39,1,30076,37935", "what": "motors", "reason": "from the drives' log"}
     preview = client.post(f"{PATH}/preview", data=form, files={"file": ("", b"")}, headers=HTML)
-    assert "Store 1 motors" in preview.text
+    assert "Store 1 motor position<" in preview.text
     assert client.get(path).json()["motor_position"] is None
     client.post(PATH, data=form, headers=HTML)
     assert client.get(path).json()["motor_position"] == [30076, 37935]

@@ -240,3 +240,12 @@ def test_metadata_may_come_as_a_file_of_json(refusing: TestClient):
     sent["metadata"] = ("blob", json.dumps(metadata()).encode(), "application/json")
     answer = refusing.post("/v1/heliostats/AA39/measurements", files=sent)
     assert answer.status_code == 415  # the metadata were taken; the image is none
+
+
+def test_a_wrong_word_in_a_query_or_header_is_named_plainly(refusing: TestClient):
+    answer = refusing.get("/v1/jobs", params={"limit": "abc"})
+    assert answer.json()["detail"] == "limit: must be a whole number"
+    answer = refusing.post("/v1/jobs/predictions", json={}, headers={"Idempotency-Key": "x" * 129})
+    assert answer.json()["detail"] == (
+        "Idempotency-Key: must be 1 to 128 letters, digits and signs of ASCII without blanks"
+    )
