@@ -11,7 +11,7 @@ from model.effects import CATALOGUE, Parameter
 from model.study import Study, conclude
 from model.study.advice import photographs_to_distinguish
 from model.study.outcome import Found
-from model.study.report import residual_map
+from model.study.report import error_covariates, residual_map
 from service.drawing.charts import Array, HeatMap, difference_map
 from service.drawing.discrepancy_chart import amount_charts
 from service.drawing.study_charts import accuracy_chart, pictures, scatters
@@ -154,6 +154,7 @@ def study_body(
         pictures=pictures(study, chart.images, ends["flux_difference"]),
         scatters=scatters(study),
         residual_map=left,
+        covariates=error_covariates(study),
         chance=1.96 / max(len(study.images) - 1, 1) ** 0.5,
         skipped=skipped or {},
         few=FEW,

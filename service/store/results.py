@@ -206,7 +206,7 @@ class Studied(NamedTuple):
 def list_studied(session: Session) -> list[Studied]:
     """What each study was of, the oldest first."""
     query = select(StudyRow.heliostats, StudyRow.last_taken_at).order_by(StudyRow.id)
-    return [Studied(*row) for row in session.execute(query).tuples()]
+    return [Studied(names, last) for names, last in session.execute(query)]
 
 
 def has_study_page(session: Session, number: int) -> bool:
