@@ -131,8 +131,8 @@ def test_unknown_query_parameters_are_refused_on_every_path(refusing: TestClient
         {
             "field": "sate",
             "message": (
-                "is not a parameter of this path; known are limit, after, state, kind, since,"
-                " until, order"
+                "is not a parameter of this path; known are limit, after, since, until, order,"
+                " state, kind"
             ),
         }
     ]
