@@ -49,6 +49,9 @@ FINE = range(1, 21)
 _STEP = 1e-4
 """Angle [rad] of the finite difference for the movement of beams with a mount's axis."""
 
+_MIN_REACH = 0.01
+"""Distance [m] from the middle below which facets are in one row or column, which has no gaps."""
+
 ORDERS = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3), (4, 0), (0, 4))
 """Powers of x and y of height changes; tilts, curvatures, and finer modes."""
 
@@ -326,7 +329,7 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
             kinds.append(
                 _heights(f"{name}{', fine' * fine}", ORDERS[2 : 2 + count], weights[:count])
             )
-    reach = np.abs(facets).max(axis=0).clip(min=1e-9)
+    reach = np.abs(facets).max(axis=0).clip(min=_MIN_REACH)
     spread = np.eye(2)[:, None] * (facets / reach)
     places = GenericKind("places", "mirror", "places", _SPREAD, weights=spread)
     names = tuple(Component(f"light along {'x' * i}{'y' * j}", "1") for i, j in ORDERS)
@@ -335,24 +338,21 @@ def mirror_kinds(facets: Array) -> list[GenericKind]:
     if len(facets) > MAX_FACETS:
         return [*kinds, alike, places]
     for fine, count in ((False, 5), (True, 9)):
-        weights = np.zeros((len(facets), count, len(facets), len(ORDERS)))
-        for facet in range(len(facets)):
-            weights[facet, :, facet] = np.eye(len(ORDERS))[:count]
-        kinds.append(
-            _heights(
-                f"facets{', fine' * fine}", ORDERS[:count], weights.reshape(-1, *weights.shape[2:])
-            )
-        )
-    single = np.zeros((len(facets), 3, len(facets), len(LIGHT_ORDERS)))
-    for facet in range(len(facets)):
-        single[facet, :, facet, :3] = np.eye(3)
+        weights = _of_each(len(facets), count, len(ORDERS))
+        kinds.append(_heights(f"facets{', fine' * fine}", ORDERS[:count], weights))
     names = tuple(
         Component(f"light{way} of facet {facet + 1}", "1")
         for facet in range(len(facets))
         for way in ("", " along x", " along y")
     )
-    light = single.reshape(-1, *single.shape[2:])
+    light = _of_each(len(facets), 3, len(LIGHT_ORDERS))
     return [*kinds, GenericKind("light", "mirror", "light", names, weights=light), alike, places]
+
+
+def _of_each(facets: int, count: int, orders: int) -> Array:
+    """Weights (facets * count, facets, orders) of the first ``count`` orders of each facet."""
+    single = np.einsum("fg,kl->fkgl", np.eye(facets), np.eye(count, orders))
+    return np.asarray(single.reshape(-1, facets, orders))
 
 
 def _share(order: tuple[int, int], part: tuple[int, int], facets: Array) -> Array:

@@ -157,6 +157,8 @@ def without_hot_pixels(flux_images: Sequence[FluxImage]) -> list[FluxImage]:
     for rows in cameras.values():
         images = [np.asarray(found[row].image, dtype=np.float64) for row in rows]
         hot = hot_pixels(images)
+        if not hot.any():
+            continue
         for row, image in zip(rows, images, strict=True):
             repaired = np.where(hot, median_filter(image, AROUND), image)
             share = float(np.abs(repaired - image).sum() / image.sum())

@@ -155,8 +155,9 @@ def _offer(session: Session, cause: CommonCause) -> Offer | None:
     if reasons <= {"moved", "pointing"}:
         names = {one.heliostat for one in cause.members if one.heliostat and one.offer}
         return offers.calibrate(sorted(names)) if names else None
-    studies = store.list_studied(session)
-    if reasons & {"accuracy", "fell"} and not offers.has_seen(studies, cause.last_at):
+    if reasons & {"accuracy", "fell"} and not offers.has_seen(
+        store.list_studied(session), cause.last_at
+    ):
         return offers.study(cause.heliostats, cause.first_at)
     return None
 

@@ -3,8 +3,7 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Form, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, StringConstraints, ValidationError
+from pydantic import BaseModel, StringConstraints
 
 from model.errors import InvalidInputError
 from service.base.fields import Lines
@@ -19,7 +18,7 @@ from service.web.resources.corrections import (
     post_exclusion_form,
 )
 from service.web.resources.studies import AdoptIn, WithdrawIn, adopt_study, withdraw_study
-from service.web.responses.pages import go_to, go_to_job
+from service.web.responses.pages import go_to, go_to_job, named_by_field
 
 router = APIRouter(include_in_schema=False)
 
@@ -39,7 +38,7 @@ def post_offer_form(
     offer: Annotated[Lines, Form()], runtime: RuntimeDep, identity: IdentityDep
 ) -> Response:
     """Do the request as REST does, and go to its job or study, or back to the page."""
-    try:
+    with named_by_field():
         chosen = ChosenOffer.model_validate_json(offer)
         body = chosen.body
         match chosen.path.split("/")[1:]:
@@ -62,6 +61,4 @@ def post_offer_form(
                 post_acknowledgements(runtime, identity, AcknowledgementsIn.model_validate(body))
             case _:
                 raise InvalidInputError(f"offer: no page offers {chosen.path}")
-    except ValidationError as error:
-        raise RequestValidationError(error.errors()) from error
     return go_to(chosen.back)

@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal, Self
 from zoneinfo import ZoneInfo
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request, Response, status
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 from sqlalchemy.orm import Session
 
 from model.ephemeris import sun_angles_at
@@ -70,7 +69,7 @@ from service.web.auth.dependencies import (
 from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.openapi import arrays, problems
-from service.web.responses.pages import go_to, leave_for, render
+from service.web.responses.pages import go_to, leave_for, named_by_field, render
 from service.web.responses.paging import ListQuery, Page, page
 from service.web.responses.representation import Maps
 
@@ -508,10 +507,8 @@ def post_forecast_form(
     form = form.in_utc(zone)
     _require_day(runtime, form.sun, zone)
     if len(form.names) != 1:
-        try:
+        with named_by_field():
             payload = FleetForecastIn(heliostats=form.names or None, **form.asked)
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
         row = enqueue(runtime, field_forecasts.KIND, payload, identity.name).row
         return leave_for(request, f"/jobs/{row.id}")
     asked = ForecastIn(heliostat=form.names[0], **form.asked)

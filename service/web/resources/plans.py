@@ -10,9 +10,8 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 from fastapi import APIRouter, Depends, Form, Path, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
-from pydantic import Field, ValidationError
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
@@ -45,7 +44,7 @@ from service.web.auth.dependencies import (
 )
 from service.web.resources.forecasts import WHENS, SunlightForm, When, sunlight_fields, time_of
 from service.web.resources.jobs import delete_job
-from service.web.responses.pages import go_to, go_to_job, leave_for, render
+from service.web.responses.pages import go_to, go_to_job, leave_for, named_by_field, render
 
 pages = APIRouter(include_in_schema=False)
 
@@ -114,7 +113,7 @@ class PlanForm(SunlightForm):
     def payload(self) -> PlanIn:
         """The payload of the job."""
         chosen = self.chosen()
-        try:
+        with named_by_field():
             return PlanIn(
                 **{name: getattr(self, name) for name in _SHARED},
                 heliostats=list(chosen) or None,
@@ -122,8 +121,6 @@ class PlanForm(SunlightForm):
                 allowed_w_m2=None if self.allowed_kw_m2 is None else 1e3 * self.allowed_kw_m2,
                 dni_w_m2=self.given_dni,
             )
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
 
 
 def _likely(targets: list[str], zone: str) -> PlanForm:
@@ -471,10 +468,8 @@ def post_aims_form(
     zone: ZoneDep,
 ) -> Response:
     """Enqueue aims for the times of the form, and go to the page of the job."""
-    try:
+    with named_by_field():
         payload = aims_for(form.in_utc(zone).payload(), zone, form.limit_map())
-    except ValidationError as error:
-        raise RequestValidationError(error.errors()) from error
     if payload is None:
         raise InvalidInputError("allowed_kw_m2: give the flux that the receiver can take")
     row = enqueue(runtime, aim_plans.KIND, payload, identity.name).row

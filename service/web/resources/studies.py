@@ -5,7 +5,6 @@ from datetime import date, datetime
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request, Response, status
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 from pydantic import (
@@ -14,7 +13,6 @@ from pydantic import (
     Field,
     InstanceOf,
     StringConstraints,
-    ValidationError,
     model_validator,
 )
 from sqlalchemy.orm import Session
@@ -77,7 +75,7 @@ from service.web.auth.dependencies import (
 from service.web.resources.models import ModelOut, current_out, model_out
 from service.web.resources.study_charts import study_timelines
 from service.web.responses.openapi import TEXT, problems
-from service.web.responses.pages import go_to, go_to_job, render
+from service.web.responses.pages import go_to, go_to_job, named_by_field, render
 from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 
 router = APIRouter(tags=["studies"])
@@ -242,10 +240,8 @@ class NewStudyForm(Model):
             "until": start_of_day(self.until, zone, 1),
             "candidates": self.candidates if is_choice else None,
         }
-        try:
+        with named_by_field():
             return StudyIn.model_validate(self.model_dump() | changes)
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
 
 
 def _names(session: Session, words: Sequence[str]) -> list[str]:

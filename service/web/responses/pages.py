@@ -3,7 +3,8 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -14,9 +15,11 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 from fastapi import Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment
 from markupsafe import Markup
+from pydantic import ValidationError
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
@@ -261,6 +264,15 @@ def _file(content: str | bytes, name: str, suffix: str) -> HTMLResponse:
         "Cache-Control": "private, no-cache",
     }
     return HTMLResponse(content, media_type=_MEDIA_TYPES[suffix], headers=headers)
+
+
+@contextmanager
+def named_by_field() -> Iterator[None]:
+    """Let mistakes of what is made from a form be answered as those of a request: by field."""
+    try:
+        yield
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error
 
 
 def go_to(path: str) -> Response:
