@@ -61,6 +61,7 @@ _TIFF_SIZES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8])
 _TIFF_NUMBERS = {3: "u2", 4: "u4"}  # SHORT and LONG
 _TIFF_MOST_TAGS = 512
 _TIFF_SUBFILE = 254  # kind of a page
+_TIFF_MOST_PREVIEWS = 16  # a picture has one for each halving of its size
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_PHOTOMETRIC, _TIFF_FORMAT, _WHITE_IS_ZERO, _UNSIGNED = 262, 339, 0, {1, 4}
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
@@ -222,13 +223,16 @@ def _next_directory(data: bytes, order: str, start: int) -> int:
 
 
 def _require_one_picture(data: bytes, order: str) -> None:
-    """Refuse a second page; a preview, of reduced resolution, is none."""
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    page = _next_directory(data, order, start)
-    if page:
+    """Refuse further pages; previews, of reduced resolution, are none."""
+    (page,) = struct.unpack_from(order + "I", data, 4)
+    for _ in range(_TIFF_MOST_PREVIEWS + 1):
+        page = _next_directory(data, order, page)
+        if not page:
+            return
         kind = _tiff_tags(data, order, page).get(_TIFF_SUBFILE)
         if kind is None or not struct.unpack_from(order + "I", data, int(kind["place"]))[0] & 1:
-            raise _unlike_a_tiff("of several pages is not supported; send one picture")
+            break
+    raise _unlike_a_tiff("of several pages is not supported; send one picture")
 
 
 def _tiff_tags(data: bytes, order: str, start: int) -> dict[int, NDArray[Any]]:

@@ -209,12 +209,16 @@ def test_a_tiff_that_readers_read_differently_is_refused(data, refusal):
         decode_image(data)
 
 
-@pytest.mark.parametrize(("kind", "is_read"), [(0, False), (2, False), (1, True)])
-def test_only_a_preview_may_follow_the_picture_of_a_tiff(kind, is_read):
-    buffer = io.BytesIO()
-    second = Image.new("L", (10, 8), 200)
-    second.encoderinfo = {"tiffinfo": {254: kind}}
-    Image.new("L", (60, 40), 50).save(buffer, "TIFF", save_all=True, append_images=[second])
+@pytest.mark.parametrize(
+    ("kinds", "is_read"),
+    [([0], False), ([2], False), ([1], True), ([1, 1], True), ([1, 0], False), ([1] * 17, False)],
+)
+def test_only_previews_may_follow_the_picture_of_a_tiff(kinds, is_read):
+    buffer, others = io.BytesIO(), []
+    for kind in kinds:
+        others.append(Image.new("L", (10, 8), 200))
+        others[-1].encoderinfo = {"tiffinfo": {254: kind}}
+    Image.new("L", (60, 40), 50).save(buffer, "TIFF", save_all=True, append_images=others)
     if is_read:
         assert decode_image(buffer.getvalue()).shape == (40, 60)
     else:
