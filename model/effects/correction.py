@@ -28,14 +28,17 @@ from torch import Tensor
 from model.covariates import SCALINGS, Covariate, slant_range
 from model.effects.base import Effect, Factor, Stage
 from model.effects.generic_kinds import (
+    BEAM_KINDS,
     IMAGE_KINDS,
     MAX_FACETS,
+    SUN_SIZE,
     GenericKind,
     SpotImages,
     beam_turns,
     changed_images,
     deformed,
     mirror_kinds,
+    with_moments,
 )
 from model.effects.scope import ByDay, scope_from_json
 from model.errors import InvalidInputError
@@ -48,12 +51,11 @@ Array = NDArray[np.float64]
 
 NAME = "correction"
 
-BEAM_KINDS = tuple(kind for kind in IMAGE_KINDS if kind.lives_in == "angle")
 CAMERA_KINDS = {kind.name: kind for kind in IMAGE_KINDS if kind.lives_in != "angle"}
 COVARIATES = {covariate.key: covariate for covariate in SCALINGS}
 KINDS = {
     kind.name: {component.name for component in kind.components}
-    for kind in (*IMAGE_KINDS, *mirror_kinds(np.zeros((MAX_FACETS, 2))))
+    for kind in (*IMAGE_KINDS, SUN_SIZE, *mirror_kinds(np.zeros((MAX_FACETS, 2))))
 }
 """Names of all kinds' components."""
 
@@ -169,12 +171,8 @@ class Correction(Effect):
         moments = np.hstack([self.amounts(kind, setups, site) for kind in BEAM_KINDS])
         if not moments.any():
             return scene
-        added = torch.as_tensor(moments).to(scene.sun)
-        before = scene.beam_moments
-        return scene.with_(
-            beam_turns=beam_turns(setups, scene),
-            beam_moments=added if before is None else before + added,
-        )
+        turned = scene.with_(beam_turns=beam_turns(setups, scene))
+        return with_moments(turned, torch.as_tensor(moments))
 
     def on_images(
         self, images: Tensor, window: Window, setups: Sequence[Setup], site: Site

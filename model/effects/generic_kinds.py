@@ -12,6 +12,7 @@ With the coefficients c_k of a photograph, its image f, places x on the target a
     warp       f(x - sum c_k u_k(x))
     scale      f exp(sum c_k p_k(x, f))
     add        f + peak(f) sum c_k p_k(x)
+    sun        trace with a sun that is 1 + c_k times as large along both directions
     heights    trace of the mirror with heights sum c_k z_k
     light      trace of the mirror with its light times 1 + sum c_k p_k
     places     trace of the mirror with facets moved by sum c_k x_k
@@ -38,7 +39,7 @@ from model.tracing.scene import COVERAGE_CELLS
 Array = NDArray[np.float64]
 Place = Literal["mirror", "angle", "camera", "target", "geometry", "added_light"]
 Owner = Literal["all", "heliostat", "camera", "target"]
-Operator = Literal["transfer", "warp", "scale", "add", "heights", "light", "places"]
+Operator = Literal["transfer", "warp", "scale", "add", "sun", "heights", "light", "places"]
 
 MAX_FACETS = 6
 """Largest number of facets that have separate components."""
@@ -190,7 +191,7 @@ class GenericKind:
         How its components change cuts; see the module's notes.
     components : tuple of K Component
     basis : callable or None
-        Functions h, u or p of the notes, (n, ...) for each component; None for mirrors.
+        Functions h, u or p of the notes, (n, ...) for each component; None for what is traced.
     weights : (K, F, L) or None
         Share of each of `ORDERS`, of `LIGHT_ORDERS`, or of x and y, in each facet's change.
     is_smooth : bool
@@ -315,6 +316,13 @@ IMAGE_KINDS = (
     GenericKind("added_light", "added_light", "add", _LIGHTS, _added),
 )
 
+SUN_SIZE = GenericKind("sun_size", "angle", "sun", _components("1", "sidewards, upwards"))
+
+BEAM_KINDS = (*(kind for kind in IMAGE_KINDS if kind.lives_in == "angle"), SUN_SIZE)
+"""Those of angles, in the order of `BeamChange.moments`."""
+
+N_MOMENTS = sum(len(kind.components) for kind in BEAM_KINDS if kind is not SUN_SIZE)
+
 
 def mirror_kinds(facets: Array) -> list[GenericKind]:
     """Kinds of mirrors with facets centred at (F, 2) [m]: of the whole mirror, of all facets alike,
@@ -416,10 +424,12 @@ def light_shapes(count: int) -> Tensor:
 
 
 def deformed(scene: Scene, kinds: Sequence[GenericKind], amounts: Tensor) -> Scene:
-    """The scene with mirrors that have amounts (n, K) of a kind.
+    """The scene with mirrors, or a sun, that have amounts (n, K) of a kind.
 
     ``kinds`` are that of each mirror, or one for all: their weights depend on the facets' places.
     """
+    if kinds[0].operator == "sun":
+        return with_moments(scene, torch.nn.functional.pad(amounts, (N_MOMENTS, 0)))
     weights = torch.as_tensor(np.stack([np.asarray(kind.weights) for kind in kinds]))
     shares = torch.einsum("nk,nkfl->nfl", amounts, weights.expand(len(amounts), -1, -1, -1))
     if kinds[0].operator == "light":
@@ -440,6 +450,12 @@ def _lit(scene: Scene, shares: Tensor) -> Scene:
     light = (light / light.mean(dim=(1, 2, 3), keepdim=True)).to(scene.sun)
     before = scene.coverage
     return scene.with_(coverage=light if before is None else before * light)
+
+
+def with_moments(scene: Scene, added: Tensor) -> Scene:
+    """The scene with ``added`` (B, 13) to the moments of its beams, whose turns it has."""
+    added, before = added.to(scene.sun), scene.beam_moments
+    return scene.with_(beam_moments=added if before is None else before + added)
 
 
 def beam_turns(setups: Sequence[Setup], scene: Scene) -> Tensor:

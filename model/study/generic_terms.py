@@ -18,6 +18,7 @@ from torch import Tensor
 from model.effects import Effect, apply_optics_effects, effects_of_stage
 from model.effects.generic_kinds import (
     IMAGE_KINDS,
+    SUN_SIZE,
     GenericKind,
     SpotImages,
     beam_turns,
@@ -41,8 +42,8 @@ Array = NDArray[np.float64]
 AT_ONCE = 8
 """Photographs whose derivatives are in memory at once."""
 
-STEP = 0.02
-"""Movement [m] of facets in the finite difference for their places."""
+STEPS = {"places": 0.02, "sun": 0.02}
+"""Movement [m] of facets, and change [1] of the sun's size, in their finite differences."""
 
 
 class GenericModel:
@@ -62,10 +63,9 @@ class GenericModel:
         first = self.aligned.groups[0].scene.control_points[0]
         facets = first.mean(dim=(-2, -1))[:, :2].double().numpy()
         is_alike = len({len(p.setup.control_points) for p in self.flux_images}) == 1
-        self.mirrors = MirrorModel(
-            forecaster, self.aligned, self.view, mirror_kinds(facets) if is_alike else []
-        )
-        self.kinds = [*IMAGE_KINDS, *self.mirrors.kinds]
+        traced = [*(mirror_kinds(facets) if is_alike else []), SUN_SIZE]
+        self.traces = TracedTerms(forecaster, self.aligned, self.view, traced)
+        self.kinds = [*IMAGE_KINDS, *traced]
 
     def spots(self, rows: NDArray[np.intp], cuts: Array) -> SpotImages:
         """The geometry of some photographs with cuts (n, 64, 64)."""
@@ -102,7 +102,7 @@ class GenericModel:
     ) -> Iterator[Array]:
         """Changes (n, 64, 64) of cuts by each component."""
         if kind.basis is None:
-            yield from self.mirrors.changes(kind, rows, coefficients)
+            yield from self.traces.changes(kind, rows, coefficients)
             return
         for part in kind.basis(spots):
             if kind.operator == "transfer":
@@ -123,31 +123,34 @@ class GenericModel:
     def _applied(
         self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
     ) -> Array:
-        if kind.operator in ("heights", "places"):
-            return np.asarray(spots.images + self.mirrors.deformation(kind, rows, coefficients))
+        if kind.operator != "light" and kind.basis is None:
+            return np.asarray(spots.images + self.traces.deformation(kind, rows, coefficients))
         if kind.basis is None:
-            changes = self.mirrors.changes(kind, rows, coefficients)
+            changes = self.traces.changes(kind, rows, coefficients)
             return np.asarray(spots.images + np.einsum("nk,knij->nij", coefficients, changes))
         return changed_images(kind, spots, coefficients)
 
 
-class MirrorModel:
-    """Traces changes of mirrors, whose ``kinds`` are those of generic terms, in some forecasts."""
+class TracedTerms:
+    """Traces changes by ``kinds`` of generic terms, of the mirrors and the sun, in forecasts."""
 
     def __init__(
         self, forecaster: Forecaster, aligned: Aligned, view: View, kinds: Sequence[GenericKind]
     ) -> None:
         self.forecaster, self.aligned, self.view, self.kinds = forecaster, aligned, view, kinds
+        self.scenes = [
+            one.scene.with_(beam_turns=beam_turns(one.setups, one.scene)) for one in aligned.groups
+        ]
         self._cached: dict[bytes, dict[str, NDArray[np.float32]]] = {}
 
     def changes(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
-        """Changes (K, n, 64, 64) of the cuts of mirrors that have coefficients (n, K)."""
-        if kind.operator == "heights" and coefficients.any():
+        """Changes (K, n, 64, 64) of the cuts that have coefficients (n, K)."""
+        if kind.operator in ("heights", "sun") and coefficients.any():
             return self._traced([kind], rows, coefficients)
         return np.asarray(self._unchanged(rows)[kind.name], dtype=np.float64)
 
     def _unchanged(self, rows: NDArray[np.intp]) -> dict[str, NDArray[np.float32]]:
-        """Changes of mirrors without coefficients, by kind; they are traced once for all cuts."""
+        """Changes of cuts without coefficients, by kind; they are traced once for all cuts."""
         key = rows.tobytes()
         if key not in self._cached:
             ends = np.cumsum([len(kind.components) for kind in self.kinds])
@@ -160,7 +163,7 @@ class MirrorModel:
     def _traced(
         self, kinds: Sequence[GenericKind], rows: NDArray[np.intp], coefficients: Array
     ) -> Array:
-        """Changes (K, n, 64, 64) by all kinds of mirrors that have coefficients of the first."""
+        """Changes (K, n, 64, 64) by all kinds, of cuts that have coefficients of the first."""
         view, (first, *_) = self.view, kinds
         heights, light = (
             [np.asarray(kind.weights) for kind in kinds if kind.operator == operator]
@@ -169,7 +172,7 @@ class MirrorModel:
 
         def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
             shapes = height_shapes(scene)
-            if first.operator == "heights" and amounts.any():
+            if amounts.any():
                 scene = deformed(scene, [first], amounts)
             found = [view.trace(scene, window, optics)[None]]
             if heights:
@@ -182,19 +185,18 @@ class MirrorModel:
                 weights = torch.as_tensor(np.concatenate(light)).to(scene.sun)
                 found.append(_light_changes(scene, window, optics, view, weights))
             for kind in kinds:
-                if kind.operator == "places":
-                    steps = STEP * torch.eye(len(kind.components)).double()
-                    moved = (
-                        deformed(scene, [kind], step.expand(scene.batch, -1)) for step in steps
-                    )
+                if kind.operator in STEPS:
+                    size = STEPS[kind.operator]
+                    steps = (size * torch.eye(len(kind.components)).double()).unbind()
+                    moved = (deformed(scene, [kind], row.expand(scene.batch, -1)) for row in steps)
                     images = [view.trace(one, window, optics)[None] for one in moved]
-                    found += [(image - found[0]) / STEP for image in images]
+                    found += [(image - found[0]) / size for image in images]
             return torch.cat(found)
 
         return self._each_part(rows, coefficients, trace)[1:]
 
     def deformation(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
-        """Change (n, 64, 64) of the cuts by mirrors that get coefficients (n, K)."""
+        """Change (n, 64, 64) of the cuts by coefficients (n, K) of a kind."""
 
         def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
             scenes = scene, deformed(scene, [kind], amounts)
@@ -213,7 +215,7 @@ class MirrorModel:
         places = {row: place for place, row in enumerate(rows.tolist())}
         found, order = [], []
         optics_effects = effects_of_stage(self.aligned.model.effects, "optics")
-        for group in self.aligned.groups:
+        for group, scene in zip(self.aligned.groups, self.scenes, strict=True):
             for window, there, alike in group.parts(self.view.windows_on(group), optics_effects):
                 some = [place for place in alike if group.rows[place] in places]
                 if not some:
@@ -223,7 +225,7 @@ class MirrorModel:
                 optics = apply_optics_effects(there, self.aligned.model.optics)
                 amounts = torch.as_tensor(coefficients[own])
                 with torch.no_grad():
-                    found.append(trace(group.scene.subset(some), window, optics, amounts).numpy())
+                    found.append(trace(scene.subset(some), window, optics, amounts).numpy())
                 order += own
         images = np.concatenate(found, axis=1)[:, np.argsort(order)]
         return np.asarray(images / images[0].sum(axis=(1, 2), keepdims=True))

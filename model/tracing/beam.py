@@ -4,7 +4,8 @@ Notes
 -----
 Light that turns by small angles with the moments c_k multiplies the spectrum of an image on a plane
 by ``exp(sum c_k h_k(a, b))``. The phases a, b are the frequency times the movement of light with
-the angle. Second moments may be negative: the light is then sharper than it was traced.
+the angle. Second moments may be negative: the light is then sharper than it was traced. A sun of
+another size stretches the frequencies at which its own transfer function is taken.
 """
 
 import math
@@ -46,8 +47,9 @@ class BeamChange:
     ----------
     moves : Tensor (B, N_TURNS, 2) [m/mrad]
         Movement of light on the plane, right and up, with each turn.
-    moments : Tensor (B, 11)
-        Factors of `sun_moments` and `axis_moments`.
+    moments : Tensor (B, 13)
+        Factors of `sun_moments` and `axis_moments`, and relative changes of the sun's size,
+        sidewards and upwards.
     """
 
     moves: Tensor
@@ -55,13 +57,25 @@ class BeamChange:
 
     def transfer(self, right: Tensor, up: Tensor) -> Tensor:
         """Transfer function (B, R, C) at frequencies right (1, C) and up (R, 1) [cycles/m]."""
-        phases = [
+        phases = self._phases(right, up)
+        terms = [*sun_moments(*phases[:2]), *axis_moments(*phases[2:])]
+        factors = self.moments[:, : len(terms)].unbind(1)
+        total = sum(c[:, None, None] * term for c, term in zip(factors, terms, strict=True))
+        exponent = torch.as_tensor(total)
+        return torch.exp(torch.complex(exponent.real.clamp(max=MAX_SHARPENING), exponent.imag))
+
+    def sun_stretch(self, right: Tensor, up: Tensor) -> Tensor:
+        """What the sun's new size adds to the square (B, R, C) [1/rad2] of frequencies that are
+        seen from the mirror, at frequencies right (1, C) and up (R, 1) [cycles/m].
+        """
+        sizes = (1 + self.moments[:, -2:]).clamp(min=0)
+        sidewards, upwards, *_ = (1e3 / (2 * math.pi) * a for a in self._phases(right, up))
+        across, along = (sizes**2 - 1)[:, :, None, None].unbind(1)
+        return across * sidewards**2 + along * upwards**2
+
+    def _phases(self, right: Tensor, up: Tensor) -> list[Tensor]:
+        """Phases (B, R, C) [1/mrad] by each turn."""
+        return [
             2 * math.pi * (move[:, 0, None, None] * right + move[:, 1, None, None] * up)
             for move in self.moves.unbind(1)
         ]
-        terms = [*sun_moments(*phases[:2]), *axis_moments(*phases[2:])]
-        total = sum(
-            c[:, None, None] * term for c, term in zip(self.moments.unbind(1), terms, strict=True)
-        )
-        exponent = torch.as_tensor(total)
-        return torch.exp(torch.complex(exponent.real.clamp(max=MAX_SHARPENING), exponent.imag))

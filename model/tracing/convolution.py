@@ -360,8 +360,10 @@ def _cone_transfer(rays: Rays, optics: Optics, right: Tensor, up: Tensor, table:
     # A sum of squares, unlike the form below, loses no digits that refinement needs.
     dx, dy, dz = d[:, :, None, None].unbind(1)
     beyond = -(dx * right + dy * up) / dz
-    angular = rays.slant_range[:, None, None] * torch.sqrt(right**2 + up**2 + beyond**2 + 1e-24)
-    transfer = _interpolate(table, angular)
+    squared = rays.slant_range[:, None, None] ** 2 * (right**2 + up**2 + beyond**2 + 1e-24)
+    if rays.beam is not None:
+        squared = (squared + rays.beam.sun_stretch(right, up)).clamp(min=1e-24)
+    transfer = _interpolate(table, torch.sqrt(squared))
     variance = torch.zeros_like(across_beam)
     if _is_given(optics.slope_error):
         cosine = (n * d).sum(-1, keepdim=True)
@@ -449,7 +451,10 @@ def _reach(rays: Rays, optics: Optics) -> float:
         float(torch.as_tensor(sigma).detach().max())
         for sigma in (optics.slope_error, optics.tracking_jitter, optics.pointing_error)
     ]
-    angle = _MARGIN * _cached(half_angle, optics.sun_shape, _CONE_SHARE) + 6 * math.hypot(*errors)
+    sun = _MARGIN * _cached(half_angle, optics.sun_shape, _CONE_SHARE)
+    if rays.beam is not None:
+        sun *= 1 + max(0.0, float(rays.beam.moments[:, -2:].max()))
+    angle = sun + 6 * math.hypot(*errors)
     return float(angle * _per_angle(rays).max())
 
 

@@ -168,7 +168,7 @@ class Scene:
         `MirrorOptics` of each mirror, in addition to `Optics`; reflectance times cleanliness.
     beam_turns : Tensor (B, 4, 3) or None [1/mrad]
         Changes of the beam's direction in ENU by the turns of `model.tracing.beam`.
-    beam_moments : Tensor (B, 11) or None
+    beam_moments : Tensor (B, 13) or None
         Moments of those angles, as in `BeamChange`; None for beams that do not change.
     """
 

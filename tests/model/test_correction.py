@@ -18,6 +18,7 @@ from model.plant_model import JUELICH_MODEL, PlantModel
 from model.study.flux_images import FluxImage, Forecaster
 from model.study.generic_terms import GenericModel
 from model.study.parameters import copied, copy_name
+from model.sunshape import Pillbox
 from tests.model.scenes import photographs, setups
 
 VIEW = View(64, 64, samples=12)
@@ -127,12 +128,27 @@ def test_what_lives_in_the_camera_never_changes_the_light_on_a_receiver():
     assert (aligned.images(VIEW) - before).abs().max() > 0.01 * before.max()
 
 
+def test_a_sun_of_half_the_size_is_traced_as_such():
+    """In both directions, against a pillbox of half the radius."""
+    halved = model_with(*(entry("sun_size", way, -0.5) for way in ("sidewards", "upwards")))
+    half, whole = (
+        replace(JUELICH_MODEL.optics, sun_shape=Pillbox(radius)) for radius in (2.3e-3, 4.6e-3)
+    )
+    expected, before = (
+        align(setups(), replace(JUELICH_MODEL, optics=optics)).flux(VIEW)
+        for optics in (half, whole)
+    )
+    flux = align(setups(), replace(halved, optics=whole)).flux(VIEW)
+    assert (flux - expected).abs().sum() < 0.02 * (before - expected).abs().sum()
+
+
 @pytest.mark.parametrize(
     "entries",
     [
         [entry("sun_moments", "width upwards", 3.0)],
         [entry("sun_moments", "skew suu", 1.0)],
         [entry("axis_blur", "about the second axis", 2.0)],
+        [entry("sun_size", "sidewards", 0.3)],
         [entry("mirror", "xy", 0.2)],
         [entry("light", "light along x of facet 1", 0.5)],
         *([one] for one in CAMERA),
