@@ -133,7 +133,7 @@ def read_cases(folder: MeasurementFolder, heliostat: str) -> list[Case]:
     surface = folder.measured_surface(heliostat)
     assert surface is not None
     return [
-        _case(folder, one, *surface)
+        _case(folder, one, surface.points, surface.degree)
         for one in folder.measurements(heliostat)
         if "cropped" in one.images
     ]
@@ -373,7 +373,9 @@ def differences() -> None:
                 for e, camera in cameras.items()
             }
             taken["counts"] = measure(image, "flux", plane)
-            forecast = {0.02: _forecasts(folder, one, *surface, ratios=(0.02,))[0.02]}
+            forecast = {
+                0.02: _forecasts(folder, one, surface.points, surface.degree, ratios=(0.02,))[0.02]
+            }
             case = Case(one.external_id, plane, one.taken_at, taken, forecast)
             rows[one.key] = {exposure: case.accuracy(str(exposure), 0.02) for exposure in exposures}
             plain[one.key] = case.accuracy("counts", 0.02)
@@ -507,7 +509,7 @@ def shadows(folder: MeasurementFolder, heliostat: str, cases: list[Case]) -> Non
     """
     surface = folder.measured_surface(heliostat)
     assert surface is not None
-    (points, degree), mirror = surface, folder.plant.heliostats[heliostat]
+    points, degree, mirror = surface.points, surface.degree, folder.plant.heliostats[heliostat]
     positions = json.loads((data_folder() / "field-positions.json").read_text())
     places = {name: np.array(entry["position_enu"]) for name, entry in positions.items()}
     near = [

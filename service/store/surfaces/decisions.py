@@ -30,6 +30,11 @@ class Justification:
     after: float | None = None
     photographs: int = 0
 
+    @property
+    def gain(self) -> float:
+        """Gain of accuracy [1]; zero if nothing was compared."""
+        return 0.0 if self.before is None or self.after is None else self.after - self.before
+
 
 def _candidate_ids(session: Session, heliostat: HeliostatRow) -> list[int]:
     query = select(SurfaceRow.version).where(
@@ -240,6 +245,19 @@ def is_undecided(session: Session, candidate: SurfaceRow) -> bool:
     """Whether nobody decided on a candidate after the decision with which it was stored."""
     query = select(DecisionRow.id).where(DecisionRow.surface_id == candidate.id).limit(2)
     return len(session.scalars(query).all()) < 2
+
+
+def find_undecided(
+    session: Session, heliostat: HeliostatRow, epoch_since: datetime
+) -> SurfaceRow | None:
+    """The newest candidate of an epoch, if nobody decided on it."""
+    query = select(SurfaceRow).where(
+        SurfaceRow.heliostat_id == heliostat.id,
+        SurfaceRow.is_candidate,
+        SurfaceRow.epoch_since == epoch_since,
+    )
+    row = session.scalar(query.order_by(SurfaceRow.version.desc()).limit(1))
+    return row if row is not None and is_undecided(session, row) else None
 
 
 def find_comparison(

@@ -18,6 +18,7 @@ from model.frames import sun_direction
 from model.times import format_minute
 from service import store
 from service.base.settings import Settings
+from service.store.surfaces import decisions
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -41,6 +42,7 @@ from service.twin.surfaces.accuracy import (
     rank_of,
 )
 from service.twin.surfaces.epochs import (
+    DROP,
     AccuracyFall,
     DayOfOthers,
     Epoch,
@@ -102,6 +104,8 @@ _SUNS, _FEW, _SPAN_DEG, _SAME_SUN_DEG = 8, 4, 20.0, 5.0
 _DATED, _OF_OPEN_ALARM = 0.9, 0.5
 # Misfit relative to the field's median, above which the model or the mirror is unusual.
 _MISFIT_RATIO = 1.5
+# Photographs of a changed mirror whose cross-validation is shown to a person.
+_MIN_TO_CONFIRM = 3
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,8 @@ class HeliostatFacts:
 
     ``study`` is the newest study's sentence about what the model lacks. ``usual_misfit`` [1] is the
     median of the field's active surfaces. ``alarms`` are its open alarms, and ``adopting`` is the
-    offer to adopt that study. ``studies`` are all.
+    offer to adopt that study. ``studies`` are all. ``confirming`` is the offer to make a changed
+    mirror's surface active.
     """
 
     limit: float
@@ -155,6 +160,7 @@ class HeliostatFacts:
     alarms: Mapping[Reason, Alarm] = field(default_factory=dict)
     adopting: Offer | None = None
     studies: Sequence[store.Studied] = ()
+    confirming: Offer | None = None
 
     @cached_property
     def usual_accuracy(self) -> float:
@@ -294,6 +300,8 @@ def _offer(facts: HeliostatFacts, cause: LikelyCause) -> Offer | None:
             return offers.predict("Predict its surface", name)
         case "clock":
             return _correct_times(facts)
+        case "mirror" if facts.confirming is not None:
+            return facts.confirming
         case "mirror" if cause.since is not None:
             return offers.predict("Predict again from photographs since then", name, cause.since)
         case "foreign_light" if cause.measurements:
@@ -585,7 +593,21 @@ def read_facts(
         alarms,
         adopting if study is not None else None,
         store.list_studied(session),
+        None if epoch is None else _confirming(session, row, epoch),
     )
+
+
+def _confirming(session: Session, heliostat: HeliostatRow, epoch: Epoch) -> Offer | None:
+    """What confirms an epoch of few photographs: a surface of them all that is clearly better."""
+    made = decisions.find_undecided(session, heliostat, epoch.since) if epoch.missing else None
+    if made is None or len(made.measurements) < epoch.photographs:
+        return None
+    active = store.find_surface_at(session, heliostat)
+    compared = decisions.find_comparison(session, made, active)
+    if compared is None or compared.photographs < _MIN_TO_CONFIRM or compared.gain < DROP:
+        return None
+    said = f"version {made.version} {compared.reason}"
+    return offers.activate(heliostat.name, made.version, said)
 
 
 def _usual_misfit(session: Session) -> float | None:

@@ -16,7 +16,7 @@ class Offer(TypedDict):
     """A request that does what an alarm or a cause asks for."""
 
     label: Annotated[str, Field(description="What it does.")]
-    method: Annotated[Literal["POST", "PATCH"], Field(description="Method of the request.")]
+    method: Annotated[Literal["POST", "PATCH", "PUT"], Field(description="Method of the request.")]
     path: Annotated[str, Field(description="Its path.")]
     body: Annotated[dict[str, object], Field(description="Its body as JSON.")]
 
@@ -33,6 +33,13 @@ def predict(label: str, heliostat: str, since: datetime | None = None) -> Offer:
     """Predict a surface, from photographs ``since`` a change if it is given."""
     change = {} if since is None else {"since": since.isoformat()}
     return _post(label, "/v1/jobs/predictions", heliostats=[heliostat], method="refined", **change)
+
+
+def activate(heliostat: str, version: int, reason: str) -> Offer:
+    """Make a version of a heliostat's surface active."""
+    path = f"/v1/heliostats/{heliostat}/surfaces/current"
+    body: dict[str, object] = {"version": version, "reason": reason[:200]}
+    return Offer(label=f"Make version {version} active", method="PUT", path=path, body=body)
 
 
 def calibrate(heliostats: Sequence[str]) -> Offer:

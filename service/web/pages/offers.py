@@ -18,6 +18,7 @@ from service.web.resources.corrections import (
     post_exclusion_form,
 )
 from service.web.resources.studies import AdoptIn, WithdrawIn, adopt_study, withdraw_study
+from service.web.resources.surfaces import ChoiceIn, put_current_surface
 from service.web.responses.pages import go_to, go_to_job, named_by_field
 
 router = APIRouter(include_in_schema=False)
@@ -55,6 +56,8 @@ def post_offer_form(
                 asked = CorrectionIn.model_validate(body)
                 form = ExclusionForm(photographs=[number], **asked.model_dump(include=_OF_FORM))
                 return post_exclusion_form(name, form, runtime, identity)
+            case ["v1", "heliostats", name, "surfaces", "current"]:
+                put_current_surface(name, runtime, identity, ChoiceIn.model_validate(body), None)
             case ["v1", "measurements", "times"]:
                 patch_times(runtime, identity, TimesIn.model_validate(body))
             case ["v1", "alarms", "acknowledgements"]:

@@ -16,6 +16,7 @@ from service.store.surfaces import decisions
 from service.store.surfaces.decisions import Justification
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import HeliostatStateRow
+from service.twin.alarms.causes import _confirming
 from service.twin.pointing.calibration import _reason
 from service.twin.surfaces.epochs import (
     FALL,
@@ -139,6 +140,29 @@ def test_promotion_of_its_surface_confirms_it(database: Database):
     found = epoch(database)
     assert found is not None
     assert not found.is_confirmed
+
+
+@pytest.mark.parametrize(("after", "is_offered"), [(0.91, True), (0.83, False)])
+def test_a_person_may_confirm_a_surface_of_too_few_photographs(
+    database: Database, after: float, is_offered: bool
+):
+    fill(database, photographs=13)
+    add_surface(database, None)
+    found = epoch(database)
+    assert found is not None
+    assert found.missing == 2
+    with database.writing() as session:
+        row = store.get_heliostat(session, "AA39")
+        assert _confirming(session, row, found) is None
+        z, points = np.zeros((4, 8, 8)), np.zeros((4, 8, 8, 3))
+        of_epoch = store.get_measurements(session, row, ["10", "11", "12"], arrays=True)
+        made = NewSurface("refined", z, z, points, epoch_since=CHANGED, measurements=of_epoch)
+        surface = store.add_surface(session, row, made).row
+        said = Justification("forecasts 3 photographs better", 0.81, after, 3)
+        decisions.reject(session, row, surface, "tester", said)
+        offer = _confirming(session, row, found)
+    expected = {"version": 2, "reason": "version 2 forecasts 3 photographs better"}
+    assert (offer and offer["body"]) == (expected if is_offered else None)
 
 
 def test_a_later_change_is_another_candidate(database: Database):
