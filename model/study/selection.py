@@ -8,7 +8,8 @@ it, with a 95 % interval. An effect is worthwhile if the lower end of the interv
 the mean is above a minimum.
 
 Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
-added. After each addition an effect that is no longer worthwhile is pruned.
+added. So is one that is much simpler than the best and gains most of what that gains: what it
+leaves may be another effect's. After each addition an effect that is no longer worthwhile is pruned.
 """
 
 from dataclasses import dataclass, replace
@@ -45,6 +46,11 @@ MIN_MOVEMENT = 0.5
 
 MIN_DISTINCTION = 0.001
 """Smallest gain of one effect over another that distinguishes them."""
+
+SIMPLER, MOST = 4, 2 / 3
+"""How many times fewer values a simpler effect has, and the share of the best one's gain that it
+must have. Values for each day also absorb what is another effect's.
+"""
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,15 @@ class ForwardSelection:
         if not significant:
             return None
         best = max(significant, key=lambda term: significant[term].score.mean())
+        most = MOST * self.gain(significant[best], current).mean
+        simpler = {
+            term: t
+            for term, t in significant.items()
+            if SIMPLER * _complexity(term, t) <= _complexity(best, significant[best])
+            and self.gain(t, current).mean >= most
+        }
+        if simpler:
+            best = max(simpler, key=lambda term: simpler[term].score.mean())
         alike = [
             term
             for term, t in significant.items()
