@@ -44,11 +44,11 @@ from service.store.photographs.image_files import digest
 from service.store.recovery.backup import images_of
 from service.store.surfaces.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
+from service.twin import operations
 from service.twin.alarms.field_overview import read_summaries
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import light_watts
 from service.twin.photographs.ingest import measurement_row
-from service.twin.runtime import operations
 from tests.faults.harness import new_store
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 

@@ -42,7 +42,7 @@ from service.jobs.worker import Worker
 from service.sources.folder import read_folder
 from service.twin.alarms.field_updates import FieldStateWriter
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.importing import import_folder
 from service.web.app import create_app
 

@@ -57,8 +57,8 @@ from model.surface import heights
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
+from service.twin import operations
 from service.twin.heliostats.outliers import reject_outliers
-from service.twin.runtime import operations
 
 Array = NDArray[np.float64]
 

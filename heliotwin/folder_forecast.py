@@ -30,6 +30,7 @@ from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasuredSurface, MeasurementFolder, points_of
 from service.sources.juelich import CENTERED_WINDOW
 from service.store.tables import NO_IMAGE, MeasurementRow
+from service.twin import operations
 from service.twin.heliostats.measurements import (
     AcceptedMeasurement,
     HeliostatContext,
@@ -38,7 +39,6 @@ from service.twin.heliostats.measurements import (
 )
 from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import motors_of
-from service.twin.runtime import operations
 
 Array = NDArray[np.float64]
 

@@ -35,12 +35,12 @@ from service.store.pointing import mounts
 from service.store.tables import NO_IMAGE, HeliostatRow, ImageRow, MeasurementRow, PlantRow
 from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
 from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
+from service.twin.operations import Forecast
 from service.twin.photographs.camera_choice import KINDS, StoredMirror, find_camera
 from service.twin.photographs.ingest import measure_photograph, measurement_row, position_row
 from service.twin.plant import model_versions, setup
 from service.twin.plant.model_versions import ModelVersion
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyInputs, add_photographs
 from service.twin.warnings import find_sun_contradictions
 

@@ -21,7 +21,7 @@ from service.base.progress import Progress, no_progress
 from service.base.validation_messages import format_validation_error
 from service.sources.documents import read_json
 from service.sources.folder import MeasurementFolder
-from service.twin.runtime import operations
+from service.twin import operations
 
 
 def asked(

@@ -49,11 +49,11 @@ from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import PLANT
 from service.store import add_study as store_study
+from service.twin import operations
 from service.twin.forecasts.heliostat_forecast import make_forecast
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.heliostats.measurements import choose_diverse
-from service.twin.runtime import operations
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
 from service.twin.transfer.importing import import_folder

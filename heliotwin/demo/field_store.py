@@ -28,7 +28,7 @@ from service.sources.folder import MeasurementFolder, read_folder
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.importing import import_folder
 
 ACTOR = "demo"

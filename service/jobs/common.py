@@ -12,7 +12,7 @@ from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import Name
 from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 Heliostats = Annotated[
     list[Name] | None,

@@ -8,7 +8,7 @@ from service.store.job_tables import JobRow
 from service.store.jobs.queue import QueueBounds, add_job, cancel, delete_plan
 from service.store.keys import ITSELF
 from service.store.rows import Added
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 def enqueue(

@@ -18,7 +18,7 @@ from service.base.arrays import pack, unpack
 from service.base.settings import Settings
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 # Seconds between two writes of a job's progress: often enough for people, rare for the database.
 _REPORT_EVERY_S = 0.5

@@ -19,10 +19,16 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
-from service.base import logs, memory, telemetry
+from service.base import monitoring, processes
 from service.base.arrays import pack
 from service.base.errors import ServiceError
-from service.base.metrics import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, measure_duration, serve_metrics
+from service.base.monitoring import (
+    JOB_ATTEMPTS,
+    JOB_SECONDS,
+    PROCESS,
+    measure_duration,
+    serve_metrics,
+)
 from service.base.settings import Settings
 from service.jobs.enqueuing import enqueue_due
 from service.jobs.heartbeat import heartbeat
@@ -32,7 +38,7 @@ from service.store import record_retention
 from service.store.job_tables import JobRow
 from service.store.jobs import queue
 from service.twin.alarms.field_updates import FieldStateWriter
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
 
@@ -166,7 +172,7 @@ class Worker:
             return False
         context = Context(self.runtime, queue.lease_of(job), job.created_by, self.stopping)
         with (
-            logs.log_context(job=job.id, kind=job.kind),
+            monitoring.log_context(job=job.id, kind=job.kind),
             measure_duration(JOB_SECONDS.labels(job.kind), f"job {job.kind}"),
         ):
             logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
@@ -360,9 +366,9 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         raise InvalidInputError(
             "job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS"
         )
-    memory.limit_memory()
-    logs.configure_logging(settings)
-    telemetry.configure_tracing(settings, "heliotwin-worker")
+    processes.limit_memory()
+    monitoring.configure_logging(settings)
+    monitoring.configure_tracing(settings, "heliotwin-worker")
     stopping, stuck = threading.Event(), threading.Event()
 
     def on_stuck() -> None:
@@ -375,7 +381,7 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         workers = Workers(runtime, kinds, settings.job_workers, on_stuck)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        with serve_metrics(settings, PROCESS), memory.returning_memory():
+        with serve_metrics(settings, PROCESS), processes.returning_memory():
             workers.start()
             stopping.wait()
             workers.stop()

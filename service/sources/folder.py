@@ -17,7 +17,7 @@ from model.plant_model import PlantModel
 from model.surface import DEGREE, control_points, greville, heights
 from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
-from service.base.plant_facts import NO_FACTS, PlantFacts
+from service.base.plant import NO_FACTS, PlantFacts
 from service.sources.deflectometry import read_deflectometry
 from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
 from service.sources.files import read_file

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from model.errors import InvalidInputError
 from service.base.fields import JsonObject
-from service.base.receivers import AnyReceiver
+from service.base.plant import AnyReceiver
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import place_heliostat
 from service.sources.plant_schema import (
@@ -37,7 +37,7 @@ def document_of(
 ) -> JsonObject:
     """The document of a heliostat, as an import of the same ``plant.yaml`` makes it.
 
-    ``stored`` are the plant's heliostat types (`service.base.plant_facts.PlantFacts`). ``goals``
+    ``stored`` are the plant's heliostat types (`service.base.plant.PlantFacts`). ``goals``
     are its receivers, then its targets.
 
     Raises

@@ -12,7 +12,7 @@ from model.plant import Plant, TargetPlane
 from model.sunshape import Buie
 from model.tracing import Optics
 from service.base.fields import JsonObject
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import sun_to_json
 from service.sources.plant_formats.imported import LAYOUT, PLANT, plant_text, site
 from service.sources.plant_receivers import receiver_entry

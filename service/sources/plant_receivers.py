@@ -10,8 +10,8 @@ from model.errors import InvalidInputError
 from model.frames import sun_direction
 from model.plant import Cylinder, TargetPlane
 from service.base.fields import JsonObject
-from service.base.receivers import NAMES_WITH_UNITS, receiver_from_json, receiver_to_json
-from service.base.receivers import AnyReceiver as AnyReceiver
+from service.base.plant import NAMES_WITH_UNITS, receiver_from_json, receiver_to_json
+from service.base.plant import AnyReceiver as AnyReceiver
 from service.sources.plant_errors import PlantText, mistakes_at
 from service.sources.plant_schema import UP, CylinderReceiver, ReceiverEntry
 from service.sources.yaml_text import KeyPath

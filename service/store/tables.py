@@ -117,7 +117,7 @@ class TargetRow(Base):
 
 
 class ReceiverRow(Base):
-    """A receiver in ENU [m], of a ``kind`` of `service.base.receivers`.
+    """A receiver in ENU [m], of a ``kind`` of `service.base.plant`.
 
     ``geometry`` has the other fields of its document.
     """

@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 
 from service.base.discovery import modules_of
-from service.base.metrics import serve_metrics
+from service.base.monitoring import serve_metrics
 from service.base.settings import Settings
 from service.jobs.kind import Kinds
 from service.jobs.kinds import KINDS
@@ -20,8 +20,8 @@ from service.jobs.worker import Workers
 from service.store.database import Database
 from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.field_overview import FieldOverviewCache
-from service.twin.runtime.runtime import Operations, Runtime
-from service.twin.runtime.slots import MAX_WAITING
+from service.twin.runtime import Operations, Runtime
+from service.twin.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter
@@ -107,7 +107,7 @@ def create_app(
 ) -> FastAPI:
     """Create the application for these settings.
 
-    ``operations`` replaces the model (`service.twin.runtime.operations`) in tests. The store is
+    ``operations`` replaces the model (`service.twin.operations`) in tests. The store is
     opened when the application starts, and an embedded SQLite store is migrated. The application
     does not start if `require_fit` raises. It accepts jobs of ``kinds``, and runs them if the
     settings say so.

@@ -22,12 +22,11 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.base import logs
-from service.base.fair_queue import as_caller
-from service.base.metrics import REQUEST_SECONDS, REQUESTS
+from service.base import monitoring
+from service.base.monitoring import REQUEST_SECONDS, REQUESTS
 from service.base.settings import Settings
 from service.store.keys import record_use
-from service.twin.runtime.slots import STOPPING
+from service.twin.slots import STOPPING, as_caller
 from service.web.auth import security
 from service.web.auth.bodies import BodyLimiter, HeldBody, JsonShape
 from service.web.auth.dependencies import takes_archive, takes_upload
@@ -85,7 +84,7 @@ class RequestIdMiddleware(_Middleware):
                 _note(scope, method, message["status"], time.perf_counter() - started)
             await send(message)
 
-        with logs.log_context(request_id=identity):
+        with monitoring.log_context(request_id=identity):
             await self.app(scope, receive, send_with_id)
 
 

@@ -8,7 +8,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from service.base import logs, memory, telemetry
+from service.base import monitoring, processes
 from service.base.errors import NotStartedError
 from service.base.settings import Settings
 from service.store.database import Database
@@ -63,15 +63,15 @@ def serve(settings: Settings, on_listening: Callable[[], None] = lambda: None) -
     SchemaError, UnauthenticatedExposureError
         From `require_fit`.
     """
-    memory.limit_memory()
-    logs.configure_logging(settings)
-    telemetry.configure_tracing(settings, "heliotwin")
+    processes.limit_memory()
+    monitoring.configure_logging(settings)
+    monitoring.configure_tracing(settings, "heliotwin")
     _require_fit(settings)
     app = create_app(settings)
     config = config_of(settings, app)
     server = _Server(config, app.state.stopping, on_listening)
     try:
-        with memory.returning_memory():
+        with processes.returning_memory():
             server.run()
     except SystemExit as refusal:  # uvicorn exits this way if the application or the port failed
         raise NotStartedError("the service could not start; the log above says why") from refusal

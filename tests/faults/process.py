@@ -18,7 +18,7 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import work
 from service.store import columns
-from service.twin.runtime import runtime
+from service.twin import runtime
 from service.web import server
 from tests.service.conftest import FakeOperations
 

@@ -16,7 +16,7 @@ from service.base.settings import Settings
 from service.jobs import heartbeat, worker
 from service.jobs.kind import Context, Kind, Kinds, Result
 from service.store.job_tables import AuditRow
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 
 
 class SquareIn(Model):

@@ -57,7 +57,7 @@ def adopt(
     from service.base.settings import Settings
     from service.sources.documents import read_json
     from service.twin.plant import model_versions
-    from service.twin.runtime.runtime import Runtime
+    from service.twin.runtime import Runtime
     from service.twin.studies.field_change import require_no_contradiction
     from service.twin.studies.study import date_report, model_of_report, parse_report, row_of_report
 

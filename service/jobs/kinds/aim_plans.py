@@ -40,7 +40,7 @@ from service.base.fields import (
     SunAt,
     parse_moment,
 )
-from service.base.memory import return_memory
+from service.base.processes import return_memory
 from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
@@ -60,7 +60,7 @@ from service.twin.forecasts.field_forecast import (
 )
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.requests import position_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MAX_STEPS = 100
 """Maximum number of steps of a day."""

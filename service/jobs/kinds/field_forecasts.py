@@ -30,7 +30,7 @@ from service.twin.forecasts.mirror_states import with_measured
 from service.twin.forecasts.requests import ReceiverChoice, position_of
 from service.twin.forecasts.watts import Sunlight, field_watts, heliostat_watts
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class FleetIn(ReceiverChoice):

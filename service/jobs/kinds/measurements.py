@@ -16,7 +16,7 @@ from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.twin.photographs.corrections import remeasure
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class MeasurementsIn(Model):

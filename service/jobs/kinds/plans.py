@@ -28,7 +28,7 @@ from service.twin.forecasts.field_forecast import (
 )
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import FieldWatts, field_watts
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MAX_TIMES = 100
 """Maximum number of times of a plan."""

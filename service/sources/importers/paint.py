@@ -9,7 +9,7 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from model.pointing import Weather
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,

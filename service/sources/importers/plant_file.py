@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from service.base.fields import Elevation, Number, Sun
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,

@@ -10,7 +10,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from service.base.errors import StoreDamagedError, UnsupportedImageError
-from service.base.file_locks import file_lock
+from service.base.processes import file_lock
 
 logger = logging.getLogger("heliotwin.service")
 

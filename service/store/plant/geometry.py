@@ -11,8 +11,13 @@ from model.plant import Receiver, TargetPlane, Tower
 from service.base import names
 from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import JsonObject
-from service.base.plant_facts import PlantFacts
-from service.base.receivers import AnyReceiver, receiver_from_json, receiver_to_json, rectangle
+from service.base.plant import (
+    AnyReceiver,
+    PlantFacts,
+    receiver_from_json,
+    receiver_to_json,
+    rectangle,
+)
 from service.store.rows import Change, Put, assign, floats, insert, insert_or_find
 from service.store.tables import HeliostatRow, MeasurementRow, PlantRow, ReceiverRow, TargetRow
 

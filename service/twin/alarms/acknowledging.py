@@ -21,7 +21,7 @@ from service.store.tables import HeliostatRow, SurfaceRow
 from service.twin.alarms.alarms import Alarm, AlarmList, find_untrusted, untrusted_fingerprint
 from service.twin.alarms.field_overview import read_summaries
 from service.twin.alarms.reasons import REASONS, Reason, Severity
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class AlarmFilter(Model):

@@ -18,7 +18,7 @@ from service.twin.forecasts.mirror_states import (
 )
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.pointing.errors import PointingState
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.camera_watch import CameraWatch, LightReading, camera_watch
 
 # Lost share of the light above which a mirror counts as dimmed. Less is not distinct from haze.

@@ -27,9 +27,9 @@ from service.twin.forecasts.requests import ForecastIn, position_of
 from service.twin.forecasts.watts import dni_of, light_watts
 from service.twin.heliostats.measurements import heights_of, load_heliostat_context
 from service.twin.heliostats.stored_mount import load_mount
+from service.twin.operations import Forecast
 from service.twin.plant.model_versions import ModelVersion, get_model
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 def _chosen_surface(

@@ -18,7 +18,7 @@ from model.plant import Heliostat
 from model.plant_model import PlantModel
 from service.base.choices import Selection
 from service.twin.heliostats.measurements import choose_diverse
-from service.twin.runtime.runtime import Operations
+from service.twin.runtime import Operations
 
 # Fewer photographs cannot outvote a wrong one.
 _FEWEST = 6

@@ -22,7 +22,7 @@ from service.twin.photographs.corrections import (
     run_corrections,
 )
 from service.twin.photographs.ingest import require_past
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MOST_ENTRIES = 2000
 """Most corrections that are given at once."""

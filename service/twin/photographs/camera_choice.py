@@ -21,7 +21,7 @@ from service.twin.heliostats.measurements import (
     to_observations,
 )
 from service.twin.plant.model_versions import declares_camera
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 KINDS = ("flux", "flux-centered")
 """Kinds of image whose background was subtracted: photographs are sRGB without a declaration."""

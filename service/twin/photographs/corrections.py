@@ -32,7 +32,7 @@ from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, Ta
 from service.twin.heliostats.metadata import metadata_columns, photograph_from_row, stored_metadata
 from service.twin.photographs.ingest import measure_photograph, measurement_row
 from service.twin.plant.model_versions import get_model
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.warnings import find_sun_contradictions, other_warnings, sun_columns
 
 Done = TypeVar("Done")

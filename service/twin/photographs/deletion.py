@@ -2,7 +2,7 @@
 
 from service.store.photographs import image_retention, photograph_deletion
 from service.store.photographs.photograph_deletion import Deleted
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 def delete_photograph(

@@ -10,7 +10,7 @@ from service.store.tables import MeasurementRow
 from service.twin.heliostats.measurements import load_heliostat_context
 from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.photographs.ingest import MeasuredImage, measure_stored
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import PhotographComparison, compare_with
 
 

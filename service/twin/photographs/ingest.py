@@ -23,7 +23,7 @@ from model.times import format_time
 from service import store
 from service.base.arrays import pack, to_json_value
 from service.base.errors import NotFoundError, StoreFullError, TooLargeError
-from service.base.metrics import ACCURACY, PHOTOGRAPHS, REFUSALS
+from service.base.monitoring import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
 from service.sources.decode import Pixels
 from service.sources.photograph import IncomingPhotograph
@@ -39,7 +39,7 @@ from service.twin.heliostats.measurements import (
 )
 from service.twin.heliostats.metadata import metadata_columns, submitted_metadata
 from service.twin.photographs.likeness import unlike_warnings
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces import accuracy
 from service.twin.warnings import find_sun_contradictions, sun_warnings
 

@@ -18,7 +18,7 @@ from service.store.surfaces.surface_versions import current_surfaces
 from service.store.tables import UNLIKE_HELIOSTAT, HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import AcceptedMeasurement, Array, HeliostatContext
 from service.twin.heliostats.stored_mount import as_calibrated
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import usual_accuracy
 from service.twin.warnings import Warnings
 

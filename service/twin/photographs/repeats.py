@@ -26,7 +26,7 @@ from service.twin.heliostats.metadata import (
 )
 from service.twin.photographs.corrections import remeasure
 from service.twin.photographs.ingest import ingest, store_position
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.warnings import find_sun_contradictions, sun_columns
 
 FILLED = "sent again with what was missing"

@@ -16,8 +16,7 @@ from model.errors import InvalidInputError
 from model.plant import Plant, Receiver, TargetPlane
 from service import store
 from service.base.fields import JsonObject
-from service.base.plant_facts import NO_FACTS, PlantFacts
-from service.base.receivers import NAMES_WITH_UNITS
+from service.base.plant import NAMES_WITH_UNITS, NO_FACTS, PlantFacts
 from service.sources.documents import read_heliostat
 from service.sources.heliostat_of_type import HeliostatOfType, document_of
 from service.sources.paint_documents import Corners

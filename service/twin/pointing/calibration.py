@@ -30,7 +30,7 @@ from service.twin.heliostats.measurements import spot_position
 from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.heliostats.stored_mount import load_mount, mount_of, true_sun, with_drive_zeros
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.epochs import Epoch, waiting_epochs
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.heliostats.stored_mount import StoredMount, stored_mount
 from service.twin.pointing.calibration import load_readings
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import result_key
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from service.base.fields import Sun
 from service.store.tables import StudyRow
 from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
 from service.twin.heliostats.measurements import heights_of, load_heliostat_context
+from service.twin.operations import Forecast
 from service.twin.plant import model_versions
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MAX_HELIOSTATS = 12
 """Most heliostats whose forecasts are computed."""

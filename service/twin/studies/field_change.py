@@ -32,7 +32,7 @@ from service.twin.heliostats.measurements import (
 )
 from service.twin.plant import model_versions
 from service.twin.plant.model_versions import Ends, ModelVersion, effect_key, effect_text, without
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.states import study_states
 from service.twin.surfaces.accuracy import forecasts_of
 

@@ -40,7 +40,7 @@ from service.twin.heliostats.measurements import (
 from service.twin.heliostats.stored_mount import mount_at
 from service.twin.plant import model_versions
 from service.twin.plant.model_versions import ModelVersion
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.known_neighbours import load_neighbours, with_neighbours
 
 Surfaces = Literal["measured", "current"]

@@ -33,6 +33,7 @@ from service.store.tables import (
     MountRow,
     SurfaceRow,
 )
+from service.twin.caches import BackgroundCache
 from service.twin.heliostats.measurements import (
     AcceptedMeasurement,
     Array,
@@ -42,8 +43,7 @@ from service.twin.heliostats.measurements import (
     load_heliostat_context,
 )
 from service.twin.plant import model_versions
-from service.twin.runtime.background_cache import BackgroundCache
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.epochs import AccuracyFall, epoch_of, find_accuracy_fall
 
 logger = logging.getLogger("heliotwin.service")

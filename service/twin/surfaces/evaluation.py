@@ -26,7 +26,7 @@ from service.twin.heliostats.measurements import (
     load_heliostat_context,
     to_observations,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import (
     forecasts_of,
     held_out_first,

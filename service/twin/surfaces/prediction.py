@@ -33,7 +33,7 @@ from service.twin.heliostats.measurements import (
     to_observations,
 )
 from service.twin.heliostats.outliers import reject_outliers
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 from service.twin.surfaces.accuracy import photographs_of_epoch
 from service.twin.surfaces.epochs import Epoch, current_epoch, epoch_of
 from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface

@@ -22,7 +22,7 @@ from service import store
 from service.base.arrays import unpack
 from service.base.errors import StoreDamagedError
 from service.base.fields import JsonObject
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.base.progress import Progress, no_progress
 from service.sources.documents import SUFFIXES, parse_declared
 from service.sources.paint_documents import (
@@ -40,7 +40,7 @@ from service.store.photographs.measurements import EXCLUDED
 from service.store.plant.model_versions import declared_of, find_current
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.metadata import photograph_from_row
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import photograph_name
 from service.twin.transfer import history
 

@@ -34,7 +34,7 @@ from service.store.keys import RESERVED
 from service.twin.heliostats.metadata import photograph_with_target
 from service.twin.photographs.repeats import receive
 from service.twin.plant import setup
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import import_surface
 from service.twin.transfer import history
 

@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 import anyio
 
 from service.base.errors import BusyError
-from service.base.fair_queue import FairQueue
+from service.twin.slots import FairQueue
 
 
 class FairLimiter:

@@ -47,7 +47,7 @@ from service.twin.alarms.reasons import (
     ReasonOf,
     SeverityOf,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,

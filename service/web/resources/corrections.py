@@ -51,7 +51,7 @@ from service.twin.photographs.corrections import (
 )
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.photographs.times import given_time, read_motors, read_times, shifted_times
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

@@ -34,7 +34,7 @@ from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, H
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
 from service.twin.alarms.reasons import SEVERITIES
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OVERVIEW_SLOT,
     READ,

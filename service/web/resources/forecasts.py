@@ -55,7 +55,7 @@ from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import camera_view, flux_of, make_forecast, size_of
 from service.twin.forecasts.requests import ForecastIn, position_of
 from service.twin.forecasts.watts import ForecastLosses, Sunlight, loss_chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

@@ -22,7 +22,7 @@ from service.jobs.uploads import (
     list_uploads,
     receive_upload,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

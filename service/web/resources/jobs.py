@@ -38,7 +38,7 @@ from service.store.jobs import queue
 from service.store.sizes import sizes
 from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
 from service.twin.forecasts.watts import loss_chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,

@@ -47,7 +47,7 @@ from service.store.photographs.measurements import MeasurementFilter
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.heliostats.metadata import spot_m
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import photograph_name
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,

@@ -34,7 +34,7 @@ from service.twin.photographs.corrections import (
 )
 from service.twin.photographs.deletion import delete_photograph
 from service.twin.photographs.display import load_for_display, pixels_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

@@ -56,7 +56,7 @@ from service.twin.photographs.corrections import (
     correct_photograph,
 )
 from service.twin.photographs.repeats import ReceivedPhotograph, receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

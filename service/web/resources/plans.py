@@ -33,7 +33,7 @@ from service.store.jobs import queue
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,

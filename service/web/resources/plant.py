@@ -18,8 +18,7 @@ from model.plant import Plant, TargetPlane
 from model.receivers import Cavity
 from service import store
 from service.base.fields import JsonObject, Model, Plane, TargetOf, Wgs84, from_row
-from service.base.plant_facts import TowerSize
-from service.base.receivers import KIND, ReceiverIn
+from service.base.plant import KIND, ReceiverIn, TowerSize
 from service.drawing.templates import figure
 from service.jobs.kinds import measurements
 from service.jobs.kinds.measurements import MeasurementsIn
@@ -42,7 +41,7 @@ from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.photographs.camera_choice import read_camera_choice
 from service.twin.plant import setup
 from service.twin.plant.model_versions import CameraAnswer, get_model
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,

@@ -49,7 +49,7 @@ from service.jobs.kinds.predictions import PredictionsIn
 from service.store.tables import PlantRow, StudyRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.studies.changes import (
     EACH_S,
     AccuracyChange,

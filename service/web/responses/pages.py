@@ -31,7 +31,7 @@ from service.drawing.templates import ASSETS, environment, form_time, moment, ti
 from service.jobs.enqueuing import enqueue
 from service.jobs.kind import Kind, Payload
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.security import LOCAL, Identity, Role
 from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
 from service.web.responses.fragments import Part

@@ -12,7 +12,7 @@ from model.errors import WeightsError
 from model.network.predictor import default_predictor
 from model.prior import default_prior
 from service.base.errors import StoreDamagedError
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import RuntimeDep
 
 

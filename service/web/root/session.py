@@ -11,7 +11,7 @@ from fastapi import APIRouter, Form, HTTPException, Request, Response, status
 
 from service.base.fields import Text
 from service.store import audit, keys, sessions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth import security
 from service.web.auth.dependencies import RuntimeDep
 from service.web.responses.openapi import problems

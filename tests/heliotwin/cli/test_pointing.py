@@ -33,7 +33,7 @@ from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.twin.heliostats.stored_mount import load_mount
 from service.twin.pointing.calibration import calibrate_store, make_plan
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.importing import import_folder
 from tests.heliotwin.cli.motor_folder import write, write_measurement
 from tests.service.conftest import QUIET, properties_document, tower_document

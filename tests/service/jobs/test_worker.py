@@ -32,8 +32,8 @@ from service.jobs.worker import Worker, Workers, pause_s
 from service.store.database import Database
 from service.store.job_tables import AuditRow, JobRow
 from service.store.jobs import queue
-from service.twin.runtime.runtime import Runtime
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.runtime import Runtime
+from service.twin.slots import ComputeSlots
 from tests.forked import ForkedProcess, forked_process
 from tests.service import job_kinds, real
 from tests.service.conftest import FakeOperations

@@ -35,7 +35,7 @@ from service.store.recovery.check import inspect_store
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.photographs.ingest import ingest
 from service.twin.plant import setup
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from tests.service.conftest import png, properties_document, sun_at
 from tests.service.store.stores import PHOTOGRAPH

@@ -25,7 +25,7 @@ from service.store.recovery.backup import back_up, images_of, restore
 from service.store.recovery.check import inspect_store
 from service.store.tables import MeasurementRow
 from service.twin.photographs.ingest import ingest
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from tests.service.conftest import png
 from tests.service.store.stores import PHOTOGRAPH
 

@@ -16,7 +16,7 @@ from service.store.database import Database
 from service.store.job_tables import AuditRow, JobRow
 from service.store.jobs import queue
 from service.store.tables import ForecastRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations
 from tests.service.store.rows import fill
 

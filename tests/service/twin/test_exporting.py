@@ -33,7 +33,7 @@ from service.store.surfaces.surface_versions import NewSurface
 from service.twin.heliostats.measurements import load_heliostat_context
 from service.twin.photographs.ingest import ingest
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
 from service.web.app import create_app

@@ -14,7 +14,7 @@ from service.sources.folder import read_folder
 from service.store import audit
 from service.store.tables import DriftRow
 from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.importing import import_folder
 from tests.service.conftest import paint_measurement, properties_document, tower_document
 

@@ -24,7 +24,7 @@ from service.store.recovery.backup import back_up, images_of, restore
 from service.store.recovery.check import inspect_store
 from service.store.tables import MeasurementRow
 from service.twin.pointing.calibration import StoreMounts, calibrate_store
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
 from tests.service.conftest import QUIET, sun_at

@@ -24,7 +24,7 @@ from service.twin.alarms.field_overview import (
     FieldTotals,
     HeliostatOverview,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from service.web.resources.field import FieldView

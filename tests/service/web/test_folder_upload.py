@@ -18,7 +18,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL, func, select
 
-from service.base.file_locks import file_lock
+from service.base.processes import file_lock
 from service.base.settings import Settings
 from service.jobs import uploads
 from service.jobs.uploads import delete_unused_uploads
@@ -309,7 +309,7 @@ import sys, time
 from pathlib import Path
 from service.base.settings import Settings
 from service.jobs import uploads
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 uploads._count = lambda *_: print("unpacked", flush=True) or time.sleep(600)
 runtime = Runtime.from_settings(Settings(data_dir=Path(sys.argv[1])), object())
 uploads.receive_upload(runtime, open(sys.argv[2], "rb"), "plant.zip", "tester")

@@ -18,10 +18,9 @@ from fastapi.testclient import TestClient
 from starlette.types import Message, Receive, Scope, Send
 
 from service.base.errors import BusyError
-from service.base.fair_queue import CALLER
 from service.base.settings import Settings
-from service.twin.runtime.runtime import Runtime
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.runtime import Runtime
+from service.twin.slots import CALLER, ComputeSlots
 from service.web.app import create_app
 from service.web.auth.bodies import BodyLimiter
 from service.web.auth.connections import Protocol, protocol_of

@@ -15,7 +15,7 @@ from sqlalchemy import URL
 from service.base.settings import Settings
 from service.store.photographs.image_files import digest
 from service.store.recovery.check import inspect_store
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,

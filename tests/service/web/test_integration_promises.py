@@ -19,7 +19,7 @@ from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store.columns import now
 from service.store.tables import DriftRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
 from service.web.app import create_app

@@ -33,7 +33,7 @@ from service.store.photographs.groups import (
     undated_groups,
 )
 from service.store.tables import TargetRow
-from service.twin.runtime import runtime
+from service.twin import runtime
 from service.web.app import create_app
 from service.web.resources import heliostats
 from service.web.resources import photographs as photograph_list

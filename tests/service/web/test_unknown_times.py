@@ -22,7 +22,7 @@ from model.times import format_minute
 from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store.columns import now
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.transfer.exporting import export_folder
 from service.twin.transfer.importing import import_folder
 from service.web.app import create_app

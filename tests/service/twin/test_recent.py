@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from service.base.recent_results import RecentResults
+from service.twin.caches import RecentResults
 from tests.service.conftest import until
 
 

@@ -1,9 +1,7 @@
-"""Receivers of every kind, as requests, the store and exports have them.
-
-A document has the ``kind`` and the fields of one of the classes here, in REST's names.
-"""
+"""The plant's receivers, tower and other facts, as requests, the store and exports have them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -11,7 +9,14 @@ from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from model.errors import InvalidInputError
-from model.plant import MIN_OPENING_DEG, Cylinder, Receiver, TargetPlane, require_cylinder_shape
+from model.plant import (
+    MIN_OPENING_DEG,
+    Cylinder,
+    Receiver,
+    TargetPlane,
+    Tower,
+    require_cylinder_shape,
+)
 from model.receivers import Cavity, Panels
 from service.base.fields import Direction, Extent, JsonObject, Model, Number, Plane, Position
 
@@ -194,3 +199,42 @@ def _values(schema: type[Model], receiver: Receiver) -> JsonObject:
 
 def _json(value: ArrayLike) -> Any:
     return np.asarray(value, dtype=np.float64).tolist()
+
+
+class TowerSize(Model):
+    """The tower: an upright cylinder on the tower base, which casts a shadow."""
+
+    radius_m: Number = Field(gt=0, lt=1e3, description="[m]")
+    height_m: Number = Field(gt=0, lt=1e4, description="[m]")
+
+    def tower(self) -> Tower:
+        """As the model has it."""
+        return Tower(self.radius_m, self.height_m)
+
+
+@dataclass(frozen=True)
+class PlantFacts:
+    """Facts of a plant; each may be None.
+
+    Attributes
+    ----------
+    tower : Tower or None
+        It casts a shadow.
+    time_zone : str or None
+        Name in the IANA time zone database.
+    heliostat_types : dict or None
+        Of ``plant.yaml``: its ``types``, and the text of the ``files`` that they name.
+    """
+
+    tower: Tower | None = None
+    time_zone: str | None = None
+    heliostat_types: JsonObject | None = None
+
+    def columns(self) -> dict[str, object]:
+        """The facts by name, in the form of the store."""
+        tower = self.tower and {"radius_m": self.tower.radius, "height_m": self.tower.height}
+        return {**vars(self), "tower": tower}
+
+
+NO_FACTS = PlantFacts()
+"""Nothing is known."""

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from model.fleet import Engine
 from service.base.errors import ConflictError
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")

@@ -18,16 +18,16 @@ from model.plant_model import PlantModel
 from model.progress import Progress
 from model.setup import Setup
 from model.study import FluxImage, Study, StudyOptions
-from service.base import metrics
+from service.base import monitoring
 from service.base.choices import Method
 from service.base.progress import Progress as Named
-from service.base.recent_results import LargeResults
 from service.base.settings import Settings
 from service.sources.decode import Pixels, TooManyPixelsError, decode_image
 from service.store.database import Database
 from service.store.photographs.image_files import ImageStore
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.caches import LargeResults
+from service.twin.operations import Forecast
+from service.twin.slots import ComputeSlots
 
 # Longest time that a request waits for the model [s].
 _PATIENCE_S = 10.0
@@ -37,7 +37,7 @@ LARGE_PIXELS = 12_500_000
 
 
 class Operations(Protocol):
-    """Interface of `service.twin.runtime.operations`: the service's use of the model."""
+    """Interface of `service.twin.operations`: the service's use of the model."""
 
     def measure(
         self,
@@ -102,13 +102,13 @@ class Operations(Protocol):
 
 
 def load_operations(networks: Path, effects_from: Sequence[Path] = ()) -> Operations:
-    """Import the module `service.twin.runtime.operations`, with the networks of a folder and the
+    """Import the module `service.twin.operations`, with the networks of a folder and the
     effects of files and installed packages (`model.effects.own`).
 
     It is imported late because it loads the tracer's libraries.
     """
     import_module("model.effects.own").load_effects(effects_from)
-    module = import_module("service.twin.runtime.operations")
+    module = import_module("service.twin.operations")
     return cast(Operations, module.ModelOperations(networks))
 
 
@@ -181,9 +181,9 @@ class Runtime:
         ``operation`` is the label in the metrics.
         """
         with ExitStack() as slots:
-            with metrics.measure_duration(metrics.WAITING_SECONDS, "wait"):
+            with monitoring.measure_duration(monitoring.WAITING_SECONDS, "wait"):
                 slots.enter_context(self.compute_slots.slot(self.timeout_s, self.check))
-            with metrics.measure_duration(metrics.MODEL_SECONDS.labels(operation), operation):
+            with monitoring.measure_duration(monitoring.MODEL_SECONDS.labels(operation), operation):
                 yield self.operations
             # At a stop, the response asked the sender to send the request again. A result that
             # comes too late must not be stored in addition.
