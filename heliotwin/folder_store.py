@@ -28,10 +28,10 @@ from service.base.settings import Settings
 from service.sources.documents import IMAGE_KINDS, get, read_json
 from service.sources.files import read_file
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, points_of
+from service.store import mounts
 from service.store.columns import Base
+from service.store.image_files import digest, media_type
 from service.store.keys import RESERVED
-from service.store.photographs.image_files import digest, media_type
-from service.store.pointing import mounts
 from service.store.tables import NO_IMAGE, HeliostatRow, ImageRow, MeasurementRow, PlantRow
 from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
 from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context

@@ -10,7 +10,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.base.processes import in_background
 from service.jobs.kind import Context
-from service.store.jobs import queue
+from service.store import queue
 
 logger = logging.getLogger("heliotwin.jobs")
 

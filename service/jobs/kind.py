@@ -16,8 +16,8 @@ from sqlalchemy.orm import Session
 
 from service.base.arrays import pack, unpack
 from service.base.settings import Settings
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.twin.runtime import Runtime
 
 # Seconds between two writes of a job's progress: often enough for people, rare for the database.

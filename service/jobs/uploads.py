@@ -28,8 +28,8 @@ from service.sources.folder import read_folder
 from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs.queue import ENDED
-from service.store.plant.geometry import require_origin
+from service.store.plant import require_origin
+from service.store.queue import ENDED
 from service.twin.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.jobs")

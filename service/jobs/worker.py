@@ -34,9 +34,8 @@ from service.jobs.enqueuing import enqueue_due
 from service.jobs.heartbeat import heartbeat
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
 from service.jobs.uploads import delete_unused_uploads
-from service.store import record_retention
+from service.store import deletion, queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.twin.alarms.field_updates import FieldStateWriter
 from service.twin.runtime import Operations, Runtime
 
@@ -74,10 +73,10 @@ def _delete_old_records(runtime: Runtime) -> int:
     """Delete a batch of each kind of record that the settings do not keep; return their number."""
     settings, deleted = runtime.settings, 0
     for records, days, prune in (
-        ("jobs", settings.job_retention_days, record_retention.prune_jobs),
-        ("plans", settings.plan_retention_days, record_retention.prune_plans),
-        ("forecasts", settings.forecast_retention_days, record_retention.prune_forecasts),
-        ("audit entries", settings.audit_retention_days, record_retention.prune_audit),
+        ("jobs", settings.job_retention_days, deletion.prune_jobs),
+        ("plans", settings.plan_retention_days, deletion.prune_plans),
+        ("forecasts", settings.forecast_retention_days, deletion.prune_forecasts),
+        ("audit entries", settings.audit_retention_days, deletion.prune_audit),
     ):
         if days:
             with runtime.database.writing() as session:

@@ -1,7 +1,7 @@
 """The database tables, one typed class each. Column names include units.
 
 Arrays are compressed npz blobs that load on demand. Images are files
-(`service.store.photographs.image_files`), referred to by their SHA-256.
+(`service.store.image_files`), referred to by their SHA-256.
 """
 
 from datetime import datetime
@@ -135,7 +135,7 @@ class ImageRow(Base):
     """A stored image file by its hash; ``accepted`` if any of its measurements was.
 
     - ``pruned_at`` is when the file was marked for deletion
-      (`service.store.photographs.image_retention`), and ``pruned_for`` is why.
+      (`service.store.image_files`), and ``pruned_for`` is why.
     - ``removed_at`` is when the file was deleted.
     - ``created_at`` is when it arrived, or arrived again after it was marked.
     """
@@ -287,7 +287,7 @@ class SurfaceRow(Base):
     - ``valid_from`` is None if its start is unknown: measured surfaces, photographs without a time.
     - ``epoch_since`` is when the epoch of the mirror began that it describes, None if it never
       changed: photographs from before show another shape (`service.twin.surfaces.epochs`).
-    - ``is_candidate``: a candidate is never active (`service.store.surfaces.decisions`).
+    - ``is_candidate``: a candidate is never active (`service.store.decisions`).
     - ``model`` names the network weights, ``model_version`` the plant's model with its effects.
     - ``trusted``, ``warnings`` (sentences), ``warned_since``, ``acknowledged_at`` and
       ``acknowledged_by`` assess a prediction (`model.observation.SurfacePrediction`). Measured

@@ -24,7 +24,7 @@ from service.base.progress import Progress as Named
 from service.base.settings import Settings
 from service.sources.decode import Pixels, TooManyPixelsError, decode_image
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
+from service.store.image_files import ImageStore
 from service.twin.caches import LargeResults
 from service.twin.operations import Forecast
 from service.twin.slots import ComputeSlots

@@ -19,9 +19,8 @@ from sqlalchemy.orm import Session
 
 from service.base.monitoring import PROCESS
 from service.base.settings import Settings
-from service.store import field_state, sizes
+from service.store import field_state, queue, sizes
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview

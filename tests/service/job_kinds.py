@@ -109,7 +109,7 @@ def _take_time(context: Context, payload: SquareIn, stays: bool) -> None:
 
 
 def _attempt(context: Context) -> int:
-    from service.store.jobs import queue
+    from service.store import queue
 
     with context.runtime.database.reading() as session:
         return queue.get_job(session, context.lease.job_id).attempts

@@ -45,7 +45,7 @@ from service.jobs.common import MAX_PIXELS, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
-from service.store.jobs import queue
+from service.store import queue
 from service.store.tables import HeliostatRow
 from service.twin.forecasts.aim_drives import AimDrives, no_drive
 from service.twin.forecasts.aim_sources import SOURCES, plant_time_zone, sources_of

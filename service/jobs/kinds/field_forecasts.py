@@ -16,7 +16,7 @@ from service import store
 from service.base.fields import AnySun, Flag, ModelVersion, Name, Position, Resolution
 from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
 from service.jobs.kind import Context, Kind, Result
-from service.store.jobs import queue
+from service.store import queue
 from service.twin.alarms.measured_states import read_mirror_states
 from service.twin.forecasts.field_forecast import (
     Checkpoint,

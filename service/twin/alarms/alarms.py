@@ -29,11 +29,10 @@ from model.times import format_minute
 from service import store
 from service.base.fields import From
 from service.base.settings import Settings
-from service.store import acknowledgements, field_state
+from service.store import acknowledgements, field_state, queue
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, AlarmRow, JobRow
-from service.store.jobs import queue
-from service.store.photographs.measurements import EXCLUDED, has_warning
+from service.store.measurements import EXCLUDED, has_warning
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,

@@ -22,7 +22,7 @@ from service.base.errors import BusyError
 from service.store import field_state
 from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
-from service.store.surfaces.surface_versions import newest_first
+from service.store.surface_versions import newest_first
 from service.store.tables import (
     HeliostatRow,
     HeliostatStateRow,

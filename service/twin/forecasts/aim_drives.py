@@ -16,7 +16,7 @@ from service import store
 from service.base.errors import ConflictError
 from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.heliostats.stored_mount import StoredMount, mount_of
 

@@ -10,9 +10,9 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service import store
+from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.tables import HeliostatRow, MountRow, PlantRow
 from service.twin.forecasts.mirror_states import MirrorStates
 from service.twin.plant import model_versions

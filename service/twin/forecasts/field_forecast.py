@@ -32,7 +32,7 @@ from service.base.errors import ConflictError
 from service.base.fields import Sun
 from service.base.processes import return_memory
 from service.base.progress import Report
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.engines import Threads, engine_of
 from service.twin.forecasts.mirror_states import MirrorState, MirrorStates, count_sources, in_state

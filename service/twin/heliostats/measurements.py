@@ -25,8 +25,8 @@ from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
 from service.sources.juelich import CENTERED_SIZE_ERROR
-from service.store.pointing import mounts
-from service.store.surfaces.surface_versions import NewSurface
+from service.store import mounts
+from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.stored_mount import as_calibrated
 from service.twin.plant import model_versions

@@ -23,7 +23,7 @@ from service import store
 from service.base.errors import ConflictError
 from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.plant import model_versions
 

@@ -20,13 +20,9 @@ from service.base.fields import JsonObject
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.columns import now
-from service.store.photographs.correction_log import (
-    delete_drift,
-    list_corrections,
-    newest_correction,
-)
-from service.store.photographs.image_files import digest
-from service.store.photographs.measurements import EXCLUDED, images_of_photograph
+from service.store.image_files import digest
+from service.store.measurements import EXCLUDED, images_of_photograph
+from service.store.photographs import delete_drift, list_corrections, newest_correction
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
 from service.twin.heliostats.metadata import metadata_columns, photograph_from_row, stored_metadata

@@ -1,7 +1,7 @@
 """Delete a photograph, and image files that nothing else needs."""
 
-from service.store.photographs import image_retention, photograph_deletion
-from service.store.photographs.photograph_deletion import Deleted
+from service.store import deletion, image_files
+from service.store.deletion import Deleted
 from service.twin.runtime import Runtime
 
 
@@ -15,16 +15,16 @@ def delete_photograph(
 ) -> Deleted:
     """Delete a photograph and then its files.
 
-    See `service.store.photographs.photograph_deletion.delete_photograph`. During a back-up the
+    See `service.store.deletion.delete_photograph`. During a back-up the
     files stay until the job `prunings` removes them.
     """
     deleted = runtime.database.run_in_transaction(
-        lambda session: photograph_deletion.delete_photograph(
+        lambda session: deletion.delete_photograph(
             session, heliostat, identifier, reason, actor, only_this
         )
     )
     with runtime.images.removing() as is_free:
         if is_free:
             with runtime.database.writing() as session:
-                image_retention.remove_marked(session, runtime.images)
+                image_files.remove_marked(session, runtime.images)
     return deleted

@@ -27,9 +27,9 @@ from service.base.monitoring import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
 from service.sources.decode import Pixels
 from service.sources.photograph import IncomingPhotograph
+from service.store import image_files
 from service.store.columns import now
-from service.store.photographs import image_retention
-from service.store.photographs.image_files import digest, media_type
+from service.store.image_files import digest, media_type
 from service.store.rows import Added
 from service.store.tables import NO_IMAGE, ImageRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
@@ -191,16 +191,13 @@ def _require_quota(session: Session, settings: Settings, sha256: str, size: int)
 
     Otherwise the job `prunings` soon deletes images.
     """
-    if (
-        image_retention.excess_bytes(session, settings, size)
-        and session.get(ImageRow, sha256) is None
-    ):
+    if image_files.excess_bytes(session, settings, size) and session.get(ImageRow, sha256) is None:
         quota = [
             rule
-            for rule in image_retention.retention_rules(session, settings)
+            for rule in image_files.retention_rules(session, settings)
             if rule.reason == "quota"
         ]
-        if not image_retention.has_candidates(session, quota):
+        if not image_files.has_candidates(session, quota):
             raise StoreFullError(
                 f"the store's images have reached their quota of {settings.image_quota_gb:g} GB,"
                 " and the active surfaces were made from all of them; nothing was stored: its"

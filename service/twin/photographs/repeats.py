@@ -14,7 +14,7 @@ from service.base.errors import ConflictError, GoneError
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.keys import RESERVED
-from service.store.photographs.correction_log import list_corrections, note_change
+from service.store.photographs import list_corrections, note_change
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import NO_IMAGE, CorrectionRow, HeliostatRow, MeasurementRow
 from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context

@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from service.base.fields import Moment, read_time
 from service.base.validation_messages import format_validation_error
 from service.sources.text_lines import ForeignLine, csv_lines
-from service.store.photographs.groups import PhotographFilter, list_groups
+from service.store.photographs import PhotographFilter, list_groups
 from service.twin.photographs.batches import MOST_ENTRIES
 from service.twin.photographs.corrections import GivenCorrection
 

@@ -31,7 +31,7 @@ from service.base.errors import ConflictError, NotFoundError
 from service.sources.documents import parse_declared
 from service.store import audit
 from service.store.columns import now
-from service.store.plant.model_versions import (
+from service.store.model_versions import (
     DECLARED,
     add_model,
     declared_of,

@@ -22,7 +22,7 @@ from service.sources.heliostat_of_type import HeliostatOfType, document_of
 from service.sources.paint_documents import Corners
 from service.store import Change, audit
 from service.store.columns import Base
-from service.store.plant.model_versions import put_declared
+from service.store.model_versions import put_declared
 from service.store.rows import Put
 from service.store.tables import HeliostatRow, ReceiverRow, TargetRow
 

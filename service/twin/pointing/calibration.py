@@ -22,9 +22,9 @@ from model.pointing.report import clock_to_json, day_of, mount_to_json
 from model.times import format_minute
 from service import store
 from service.base.errors import ConflictError
+from service.store import mounts
 from service.store.columns import now
-from service.store.pointing import mounts
-from service.store.pointing.mounts import CalibrationState
+from service.store.mounts import CalibrationState
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
 from service.twin.heliostats.measurements import spot_position
 from service.twin.heliostats.metadata import photograph_from_row

@@ -22,7 +22,7 @@ from model.pointing.spots import spot_covariance
 from model.times import format_minute
 from service import store
 from service.base.errors import ServiceError
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
 from service.twin.heliostats.stored_mount import StoredMount, stored_mount
 from service.twin.pointing.calibration import load_readings

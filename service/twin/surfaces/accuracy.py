@@ -23,7 +23,7 @@ from service import store
 from service.base.errors import ServiceError
 from service.base.settings import Settings
 from service.store.listing import EVER, Period
-from service.store.photographs.measurements import PREFERENCE
+from service.store.measurements import PREFERENCE
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,

@@ -14,9 +14,9 @@ from model.metrics import flux_accuracy
 from model.study.judging import Gain, few_gain
 from service import store
 from service.base.choices import Method
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
-from service.store.surfaces.surface_versions import NewSurface
+from service.store import decisions
+from service.store.decisions import Justification
+from service.store.surface_versions import NewSurface
 from service.store.tables import MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     Array,

@@ -17,11 +17,10 @@ from model.progress import Progress, silent
 from service import store
 from service.base.choices import Method, Selection, require_images
 from service.base.errors import ConflictError
-from service.store import audit
+from service.store import audit, decisions
+from service.store.decisions import Justification
 from service.store.keys import RESERVED
 from service.store.rows import lock_heliostat
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
 from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.measurements import (
     HeliostatContext,

@@ -36,8 +36,8 @@ from service.sources.paint_documents import (
 from service.sources.photograph import IncomingPhotograph
 from service.sources.plant_export import export_plant
 from service.store.columns import EPOCH
-from service.store.photographs.measurements import EXCLUDED
-from service.store.plant.model_versions import declared_of, find_current
+from service.store.measurements import EXCLUDED
+from service.store.model_versions import declared_of, find_current
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.heliostats.metadata import photograph_from_row
 from service.twin.runtime import Runtime

@@ -42,12 +42,8 @@ from service.base.validation_messages import format_validation_error
 from service.sources.documents import parse_declared, read_json
 from service.sources.files import read_file
 from service.store import audit
-from service.store.photographs.measurements import (
-    EXCLUDED,
-    find_measurement_of_image,
-    find_position,
-)
-from service.store.records import many, record
+from service.store.measurements import EXCLUDED, find_measurement_of_image, find_position
+from service.store.rows import many, record
 from service.store.tables import (
     UNLIKE_HELIOSTAT,
     AliasRow,

@@ -37,9 +37,9 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline, Value
+from service.store import mounts
 from service.store.columns import EPOCH
 from service.store.listing import EVER, NEWEST_FIRST, Period
-from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
 from service.twin.forecasts.aim_sources import plant_time_zone

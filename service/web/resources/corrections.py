@@ -31,8 +31,8 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
-from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
-from service.store.photographs.measurements import count_undated
+from service.store.measurements import count_undated
+from service.store.photographs import list_corrections, made_from, newest_correction
 from service.store.tables import MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.photographs.batches import (

@@ -46,9 +46,9 @@ from service.drawing.templates import irradiance, times_in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
+from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.tables import ForecastRow, HeliostatRow, PlantRow
 from service.twin.alarms.measured_states import read_requested_states
 from service.twin.forecasts.aim_sources import plant_time_zone

@@ -22,19 +22,18 @@ from service.drawing.timelines import Timeline
 from service.sources.heliostat_document import HeliostatDocument
 from service.sources.heliostat_of_type import HeliostatOfType
 from service.sources.schema import HeliostatProperties
-from service.store import acknowledgements, audit
+from service.store import acknowledgements, audit, decisions, mounts
+from service.store.decisions import Justification, find_comparison
 from service.store.listing import NEWEST_FIRST
-from service.store.photographs.correction_log import list_corrections, newest_correction
-from service.store.photographs.groups import (
+from service.store.photographs import (
     PhotographFilter,
     PhotographGroup,
     PhotographVerdict,
+    list_corrections,
     list_groups,
+    newest_correction,
 )
-from service.store.pointing import mounts
 from service.store.rows import Put
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification, find_comparison
 from service.store.tables import CorrectionRow, DecisionRow, HeliostatRow, MountRow, SurfaceRow
 from service.twin.alarms import causes
 from service.twin.alarms.causes import (

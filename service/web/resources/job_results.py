@@ -16,9 +16,9 @@ from service.drawing.charts import HeatMap
 from service.drawing.templates import in_words
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.jobs.kinds.aim_plans import MAX_STEPS, step_name
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
-from service.store.pointing.mounts import mounts_of_versions
+from service.store.mounts import mounts_of_versions
 from service.twin.pointing.calibration import UndatedCount
 
 StepNumber = Annotated[

@@ -33,8 +33,8 @@ from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
 from service.jobs.kinds.plans import MAX_TIMES, map_name
 from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.sizes import sizes
 from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
 from service.twin.forecasts.watts import loss_chain

@@ -42,8 +42,8 @@ from service.drawing.pictures import flux_picture
 from service.sources.photograph import IncomingPhotograph
 from service.sources.schema import WeatherFields, paint_motors
 from service.store.listing import Order, Period
-from service.store.photographs.correction_log import newest_correction
-from service.store.photographs.measurements import MeasurementFilter
+from service.store.measurements import MeasurementFilter
+from service.store.photographs import newest_correction
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.heliostats.metadata import spot_m
 from service.twin.photographs.repeats import receive

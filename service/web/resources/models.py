@@ -7,7 +7,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
 from service.base.fields import from_row
-from service.store.plant.model_versions import declared_of
+from service.store.model_versions import declared_of
 from service.store.tables import ModelRow
 from service.twin.plant import model_versions
 from service.web.auth.dependencies import READ, RuntimeDep

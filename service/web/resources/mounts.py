@@ -33,7 +33,7 @@ from service.base.fields import (
     Version,
     plant_time_to_utc,
 )
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import MountRow
 from service.twin.alarms.field_overview import (
     PATIENCE_S,

@@ -38,14 +38,14 @@ from service.base.names import IDENTIFIER
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.listing import Period
-from service.store.photographs.correction_log import newest_correction
-from service.store.photographs.groups import (
+from service.store.photographs import (
     PhotographFilter,
     PhotographGroup,
     PhotographVerdict,
     count_groups,
     get_group,
     list_groups,
+    newest_correction,
 )
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
 from service.twin.forecasts.aim_sources import plant_time_zone

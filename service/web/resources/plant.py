@@ -34,7 +34,7 @@ from service.sources.documents import (
 from service.sources.plant_schema import CameraEntry, FacetGridEntry, HeliostatTypeEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store import audit
-from service.store.plant.model_versions import declared_of, find_current
+from service.store.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
 from service.twin.forecasts.heliostat_forecast import receiver_as_json

@@ -35,9 +35,9 @@ from service.base.fields import (
     from_row,
 )
 from service.drawing.pictures import surface_picture
+from service.store import decisions
 from service.store.listing import Order, Period
-from service.store.surfaces import decisions
-from service.store.surfaces.surface_versions import SurfaceFilter
+from service.store.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
 from service.twin.alarms.field_overview import field_totals

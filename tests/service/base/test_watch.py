@@ -26,7 +26,7 @@ from service.base import monitoring
 from service.base.errors import NotStartedError
 from service.base.monitoring import serve_metrics
 from service.base.settings import Settings
-from service.store.jobs.queue import add_job
+from service.store.queue import add_job
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.runtime import Runtime
 from service.web import store_metrics

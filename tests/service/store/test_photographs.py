@@ -22,16 +22,14 @@ from service.jobs.kinds import KINDS
 from service.jobs.kinds.prunings import PruningsIn, prune
 from service.jobs.worker import Worker
 from service.sources.photograph import IncomingPhotograph
-from service.store import audit, sizes
+from service.store import audit, image_files, queue, sizes
+from service.store.backup import back_up, restore
+from service.store.check import inspect_store
 from service.store.columns import now
 from service.store.database import Database
+from service.store.image_files import ImageStore, digest
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.keys import RESERVED
-from service.store.photographs import image_retention
-from service.store.photographs.image_files import ImageStore, digest
-from service.store.recovery.backup import back_up, restore
-from service.store.recovery.check import inspect_store
 from service.store.tables import ImageRow, MeasurementRow
 from service.twin.photographs.ingest import ingest
 from service.twin.plant import setup
@@ -348,5 +346,5 @@ def test_nothing_is_given_up_where_the_settings_keep_all(runtime: Runtime):
     age(runtime, 30_000, 1, 2, 3, 9)
     forever = with_(runtime)
     with runtime.database.reading() as session:
-        assert image_retention.retention_rules(session, forever.settings) == []
+        assert image_files.retention_rules(session, forever.settings) == []
     assert do(forever)["images"] == 0

@@ -10,11 +10,11 @@ import pytest
 from service import store
 from service.base.errors import ConflictError
 from service.base.settings import Settings
+from service.store import decisions
 from service.store.database import Database
-from service.store.pointing.mounts import CalibrationState
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.decisions import Justification
+from service.store.mounts import CalibrationState
+from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatStateRow
 from service.twin.pointing.calibration import _reason
 from service.twin.surfaces.epochs import (

@@ -28,8 +28,8 @@ from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.folder import read_folder, read_surface
 from service.sources.photograph import IncomingPhotograph
-from service.store.pointing.mounts import add_mount
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.mounts import add_mount
+from service.store.surface_versions import NewSurface
 from service.twin.heliostats.measurements import load_heliostat_context
 from service.twin.photographs.ingest import ingest
 from service.twin.plant import model_versions

@@ -32,8 +32,8 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.image_files import ImageStore
+from service.store.surface_versions import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin.runtime import Operations, Runtime
 from service.twin.slots import ComputeSlots

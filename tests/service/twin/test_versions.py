@@ -22,7 +22,7 @@ from service.jobs.worker import Worker
 from service.store import audit, keys
 from service.store.database import Database
 from service.store.job_tables import AuditRow
-from service.store.plant.model_versions import put_declared
+from service.store.model_versions import put_declared
 from service.store.tables import MODEL_VERSION
 from service.twin.plant import model_versions
 from tests.service.command import exit_code

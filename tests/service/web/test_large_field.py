@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 
 from service import store
 from service.base.settings import Settings
-from service.store.jobs import queue
-from service.store.pointing.mounts import CalibrationState
+from service.store import queue
+from service.store.mounts import CalibrationState
 from service.twin.caches import RecentResults
 from service.twin.pointing import calibration
 from service.web.app import create_app

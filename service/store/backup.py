@@ -2,7 +2,7 @@
 
 A back-up runs while the service runs. It reads the database in one snapshot, then copies the
 images. This order suffices, because an image is stored before its row, and never changes. Deletion
-of images waits meanwhile (`service.store.photographs.image_retention`). SQLite is copied by its
+of images waits meanwhile (`service.store.image_files`). SQLite is copied by its
 back-up function, PostgreSQL table by table with COPY, so that no external tool is needed. A restore
 verifies all hashes before it writes, and writes only into an empty store.
 """
@@ -28,7 +28,7 @@ from service.base.progress import Progress, no_progress
 from service.base.settings import Settings
 from service.base.validation_messages import format_validation_error
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
+from service.store.image_files import ImageStore
 
 _FORMAT = 1
 _MANIFEST, _SQLITE, _IMAGES, _LIST = "manifest.json", "database.sqlite", "images", "images.txt"

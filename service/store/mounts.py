@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session, undefer
 from service.base.errors import ConflictError, NotFoundError
 from service.store.columns import now
 from service.store.listing import Period
-from service.store.photographs.measurements import EXCLUDED
+from service.store.measurements import EXCLUDED
 from service.store.rows import ROUNDS, insert, lock_row
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from service.base.errors import StoreDamagedError
 from service.base.progress import Progress
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
+from service.store.image_files import ImageStore
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow
 
 # Images per database query.

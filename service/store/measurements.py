@@ -12,7 +12,7 @@ from service.base.errors import ConflictError, NotFoundError
 from service.store import sizes
 from service.store.columns import now
 from service.store.listing import EVER, Order, Period, select_after
-from service.store.plant.geometry import get_target
+from service.store.plant import get_target
 from service.store.rows import ROUNDS, Added, insert, lock_heliostat, lock_row
 from service.store.tables import (
     NO_IMAGE,

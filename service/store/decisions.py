@@ -11,9 +11,9 @@ from service.base.errors import ConflictError
 from service.store import audit
 from service.store.columns import EPOCH, now
 from service.store.listing import NEWEST_FIRST, select_after
-from service.store.plant.geometry import get_heliostat
+from service.store.plant import get_heliostat
 from service.store.rows import lock_heliostat
-from service.store.surfaces.surface_versions import find_surface_at, get_surface
+from service.store.surface_versions import find_surface_at, get_surface
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 
 
@@ -69,7 +69,7 @@ def _record(
 
 def _sort_key(row: SurfaceRow) -> tuple[datetime, int]:
     """Sort key of a version, in the order of
-    `service.store.surfaces.surface_versions.newest_first`.
+    `service.store.surface_versions.newest_first`.
     """
     return row.valid_from or EPOCH, row.version
 

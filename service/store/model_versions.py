@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from model.effects import Effect, effect_to_json, model_version
 from service.base.errors import ConflictError
 from service.store.keys import RESERVED
-from service.store.plant.geometry import get_plant, is_plant_new
+from service.store.plant import get_plant, is_plant_new
 from service.store.rows import Change, insert
 from service.store.tables import ModelRow, PlantRow, StudyRow
 
