@@ -31,7 +31,7 @@ from model.plant import Heliostat
 from service.sources.decode import decode_image
 from service.sources.folder import measured_heights, read_folder
 from service.twin import operations
-from service.twin.heliostats.measurements import AcceptedMeasurement, choose_diverse
+from service.twin.measurements import AcceptedMeasurement, choose_diverse
 from service.twin.photographs import likeness
 from training.render import TOWER_TOP
 from training.surfaces import load_surfaces

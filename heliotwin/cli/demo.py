@@ -52,11 +52,11 @@ from service.store import add_study as store_study
 from service.twin import operations
 from service.twin.forecasts.heliostat_forecast import make_forecast
 from service.twin.forecasts.requests import ForecastIn
-from service.twin.heliostats.measurements import choose_diverse
+from service.twin.importing import import_folder
+from service.twin.measurements import choose_diverse
 from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
-from service.twin.transfer.importing import import_folder
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,9 @@ from service.jobs.worker import Worker
 from service.sources.folder import MeasurementFolder, read_folder
 from service.store import queue
 from service.store.job_tables import JobRow
+from service.twin.importing import import_folder
 from service.twin.photographs.repeats import receive
 from service.twin.runtime import Runtime
-from service.twin.transfer.importing import import_folder
 
 ACTOR = "demo"
 """Who the store says made its jobs and sent its photographs."""

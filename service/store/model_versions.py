@@ -1,4 +1,4 @@
-"""Storage of versions of the plant's model; see `service.twin.plant.model_versions`.
+"""Storage of versions of the plant's model; see `service.twin.model_versions`.
 
 This module imports effects and with them the ray tracer's libraries. Therefore `service.store` does
 not import it, and programs that only query the database start fast.

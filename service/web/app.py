@@ -18,8 +18,8 @@ from service.jobs.kinds import KINDS
 from service.jobs.uploads import delete_unused_uploads
 from service.jobs.worker import Workers
 from service.store.database import Database
-from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.field_overview import FieldOverviewCache
+from service.twin.alarms.reasons import AlarmCount
 from service.twin.runtime import Operations, Runtime
 from service.twin.slots import MAX_WAITING
 from service.twin.surfaces.accuracy import ComparisonCache

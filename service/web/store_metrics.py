@@ -26,7 +26,7 @@ from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.reasons import REASONS
 from service.twin.runtime import Runtime
-from service.twin.studies.camera_watch import CHANGES, CameraChange
+from service.twin.studies.cameras import CHANGES, CameraChange
 
 _VERDICTS = {True: "yes", False: "no", None: "unknown"}
 

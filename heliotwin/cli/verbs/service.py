@@ -27,7 +27,7 @@ app = typer.Typer()
 def import_(folder: Folder, as_json: AsJson = False) -> None:
     """Import a measurement folder into the store; a second run changes nothing."""
     from service.sources.folder import read_folder
-    from service.twin.transfer.importing import import_folder
+    from service.twin.importing import import_folder
 
     keep_private()
     source = read_folder(folder, whole_field=True)
@@ -46,7 +46,7 @@ def export(
 
     `heliotwin import` reads it.
     """
-    from service.twin.transfer.exporting import export_folder
+    from service.twin.exporting import export_folder
 
     with open_runtime() as runtime, progress(None, "export") as step:
         report = export_folder(runtime, folder, step)

@@ -14,8 +14,8 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kind import Context, Kind, Result
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
+from service.twin import model_versions
 from service.twin.photographs.corrections import remeasure
-from service.twin.plant import model_versions
 from service.twin.runtime import Runtime
 
 

@@ -16,7 +16,7 @@ from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.kind import Context, Kind, Result
 from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
-from service.twin.plant import model_versions
+from service.twin import model_versions
 from service.twin.runtime import Runtime
 from service.twin.surfaces.evaluation import PARTS
 from service.twin.surfaces.prediction import (

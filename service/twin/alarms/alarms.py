@@ -45,17 +45,16 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.alarms import offers
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
-from service.twin.alarms.light import LostLight, find_lost_light
-from service.twin.alarms.measured_states import measure_states
+from service.twin.alarms.measured_states import LostLight, find_lost_light, measure_states
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, ReasonOf, SeverityOf
 from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
 from service.twin.forecasts.mirror_states import MirrorStates
-from service.twin.plant import model_versions
-from service.twin.pointing.errors import DriveStep, PointingState
-from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
+from service.twin.pointing_errors import DriveStep, PointingState
+from service.twin.studies.cameras import FIGURES, CameraChange, CameraReadings
 from service.twin.studies.field_change import AdoptableStudy, EffectFindings
 
 AlarmId = Annotated[

@@ -26,26 +26,26 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.alarms import offers
 from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import Reason
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.heliostats.outliers import list_outliers
-from service.twin.plant import model_versions
 from service.twin.surfaces.accuracy import (
     PhotographComparison,
     photograph_name,
     photographs_of_surface,
     rank_of,
 )
-from service.twin.surfaces.epochs import (
+from service.twin.surfaces.present_shape import (
     AccuracyFall,
     DayOfOthers,
     Epoch,
     current_epoch,
     fell_with_others,
+    list_outliers,
     others_on,
     read_fall,
 )

@@ -30,12 +30,12 @@ from service.store.tables import (
     MountRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.caches import BackgroundCache, RecentResults
-from service.twin.plant import model_versions
-from service.twin.pointing.errors import MountKey, PointingState, find_pointing
+from service.twin.pointing_errors import MountKey, PointingState, find_pointing
 from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank, accuracy_series, result_key
-from service.twin.surfaces.epochs import FALL, AccuracyFall
+from service.twin.surfaces.present_shape import FALL, AccuracyFall
 
 Result = TypeVar("Result")
 logger = logging.getLogger("heliotwin.service")

@@ -32,7 +32,7 @@ from service.twin.alarms.field_overview import (
     read_summaries,
 )
 from service.twin.runtime import Runtime
-from service.twin.studies.camera_watch import CHANGES, CameraChange, camera_watch
+from service.twin.studies.cameras import CHANGES, CameraChange, camera_watch
 from service.twin.studies.field_change import EffectWatch
 
 logger = logging.getLogger("heliotwin.jobs")

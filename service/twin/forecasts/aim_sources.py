@@ -14,8 +14,8 @@ from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow, MountRow, PlantRow
+from service.twin import model_versions
 from service.twin.forecasts.mirror_states import MirrorStates
-from service.twin.plant import model_versions
 
 KIND = "aim-plans"
 

@@ -37,9 +37,9 @@ from service.store.tables import HeliostatRow, MountRow
 from service.twin.engines import Threads, engine_of
 from service.twin.forecasts.mirror_states import MirrorState, MirrorStates, count_sources, in_state
 from service.twin.forecasts.watts import Sunlight, dni_of
-from service.twin.heliostats.stored_mount import as_calibrated
-from service.twin.plant.model_versions import ModelVersion
+from service.twin.model_versions import ModelVersion
 from service.twin.runtime import Runtime
+from service.twin.stored_mount import as_calibrated
 
 Array = NDArray[np.float64]
 

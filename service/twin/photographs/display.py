@@ -7,9 +7,9 @@ from service import store
 from service.base.errors import NotFoundError
 from service.sources.decode import Pixels
 from service.store.tables import MeasurementRow
-from service.twin.heliostats.measurements import load_heliostat_context
-from service.twin.heliostats.metadata import photograph_from_row
+from service.twin.measurements import load_heliostat_context
 from service.twin.photographs.ingest import MeasuredImage, measure_stored
+from service.twin.photographs.metadata import photograph_from_row
 from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import PhotographComparison, compare_with
 

@@ -32,16 +32,16 @@ from service.store.columns import now
 from service.store.image_files import digest, media_type
 from service.store.rows import Added
 from service.store.tables import NO_IMAGE, ImageRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
-    HeliostatContext,
-    accepted_measurement,
-    load_heliostat_context,
-)
-from service.twin.heliostats.metadata import metadata_columns, submitted_metadata
+from service.twin.measurements import HeliostatContext, accepted_measurement, load_heliostat_context
 from service.twin.photographs.likeness import unlike_warnings
+from service.twin.photographs.metadata import (
+    find_sun_contradictions,
+    metadata_columns,
+    submitted_metadata,
+    sun_warnings,
+)
 from service.twin.runtime import Runtime
 from service.twin.surfaces import accuracy
-from service.twin.warnings import find_sun_contradictions, sun_warnings
 
 # Tolerance for a camera's clock that is ahead of the server's clock.
 _AHEAD = timedelta(days=1)

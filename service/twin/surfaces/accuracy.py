@@ -33,8 +33,9 @@ from service.store.tables import (
     MountRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.caches import BackgroundCache
-from service.twin.heliostats.measurements import (
+from service.twin.measurements import (
     AcceptedMeasurement,
     Array,
     HeliostatContext,
@@ -42,9 +43,8 @@ from service.twin.heliostats.measurements import (
     heights_of,
     load_heliostat_context,
 )
-from service.twin.plant import model_versions
 from service.twin.runtime import Runtime
-from service.twin.surfaces.epochs import AccuracyFall, epoch_of, find_accuracy_fall
+from service.twin.surfaces.present_shape import AccuracyFall, epoch_of, find_accuracy_fall
 
 logger = logging.getLogger("heliotwin.service")
 RECENT = 8

@@ -18,7 +18,7 @@ from service.store import decisions
 from service.store.decisions import Justification
 from service.store.surface_versions import NewSurface
 from service.store.tables import MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
+from service.twin.measurements import (
     Array,
     HeliostatContext,
     accepted_measurement,
@@ -33,7 +33,7 @@ from service.twin.surfaces.accuracy import (
     photograph_name,
     photographs_of_surface,
 )
-from service.twin.surfaces.epochs import epoch_of
+from service.twin.surfaces.present_shape import epoch_of
 
 MIN_HELD_OUT = 5
 """Least number of held-out photographs that can decide which surface is better."""

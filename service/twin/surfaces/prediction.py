@@ -22,7 +22,7 @@ from service.store.decisions import Justification
 from service.store.keys import RESERVED
 from service.store.rows import lock_heliostat
 from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
+from service.twin.measurements import (
     HeliostatContext,
     accepted_measurement,
     choose_diverse,
@@ -31,11 +31,10 @@ from service.twin.heliostats.measurements import (
     named_measurements,
     to_observations,
 )
-from service.twin.heliostats.outliers import reject_outliers
 from service.twin.runtime import Operations, Runtime
 from service.twin.surfaces.accuracy import photographs_of_epoch
-from service.twin.surfaces.epochs import Epoch, current_epoch, epoch_of
 from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface
+from service.twin.surfaces.present_shape import Epoch, current_epoch, epoch_of, reject_outliers
 
 # Candidates per requested image, because some may contradict the others.
 _SPARE = 2

@@ -37,10 +37,10 @@ from service.twin.alarms.acknowledging import (
 )
 from service.twin.alarms.alarms import Alarm, AlarmId, AlarmList, read_alarms
 from service.twin.alarms.common_causes import CommonCause, find_common_causes
-from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.reasons import (
     REASONS,
     SEVERITIES,
+    AlarmCount,
     CountByReason,
     HeliostatOrPlant,
     Reason,

@@ -45,11 +45,11 @@ from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surf
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import trace_request
 from service.twin.forecasts.requests import ForecastIn
-from service.twin.heliostats.facets import facet_places
 from service.twin.operations import Forecast
 from service.twin.runtime import Runtime
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.accuracy import RECENT, ComparisonResult, is_misleading
-from service.twin.surfaces.epochs import epoch_of
+from service.twin.surfaces.present_shape import epoch_of
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     READ,

@@ -40,8 +40,12 @@ from service.twin.photographs.batches import (
     MOTORS,
     TIMES,
     correct_many,
+    given_time,
     list_batches,
     preview_many,
+    read_motors,
+    read_times,
+    shifted_times,
     undo_batch,
 )
 from service.twin.photographs.corrections import (
@@ -50,7 +54,6 @@ from service.twin.photographs.corrections import (
     correct_photographs,
 )
 from service.twin.photographs.deletion import delete_photograph
-from service.twin.photographs.times import given_time, read_motors, read_times, shifted_times
 from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,

@@ -21,7 +21,6 @@ from service.drawing.charts import CONDITION, ColourScale
 from service.drawing.pictures import places_picture
 from service.drawing.templates import in_zone
 from service.store.tables import HeliostatRow
-from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.field_filter import (
     CONDITIONS,
     METRICS,
@@ -32,7 +31,7 @@ from service.twin.alarms.field_filter import (
 )
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
-from service.twin.alarms.reasons import SEVERITIES
+from service.twin.alarms.reasons import SEVERITIES, AlarmCount
 from service.twin.forecasts.aim_sources import plant_time_zone
 from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (

@@ -35,6 +35,7 @@ from service.store.photographs import (
 )
 from service.store.rows import Put
 from service.store.tables import CorrectionRow, DecisionRow, HeliostatRow, MountRow, SurfaceRow
+from service.twin import plant_setup
 from service.twin.alarms import causes
 from service.twin.alarms.causes import (
     HeliostatFacts,
@@ -49,11 +50,10 @@ from service.twin.alarms.field_overview import (
     read_summaries,
     with_pointing,
 )
+from service.twin.calibration import CalibrationSlot, best_slot
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.heliostats.facets import facet_places
-from service.twin.plant import setup
-from service.twin.plant.setup import Authorship
-from service.twin.pointing.calibration import CalibrationSlot, best_slot
+from service.twin.plant_setup import Authorship
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.accuracy import ComparisonResult, rank_of
 from service.web.auth.dependencies import (
     OPERATE,
@@ -159,8 +159,8 @@ def _set(
     replace: bool = True,
 ) -> Put[HeliostatRow]:
     if isinstance(given, HeliostatOfType):
-        return setup.set_heliostat_of_type(session, by, name, given, replace)
-    return setup.set_heliostat(session, by, name, given.raw, replace)
+        return plant_setup.set_heliostat_of_type(session, by, name, given, replace)
+    return plant_setup.set_heliostat(session, by, name, given.raw, replace)
 
 
 router = APIRouter(tags=["heliostats"])
@@ -262,7 +262,7 @@ def delete_heliostat(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> 
     This is refused if photographs, surfaces or anything else refers to it.
     """
     runtime.database.run_in_transaction(
-        lambda session: setup.remove(session, by, "heliostat", name)
+        lambda session: plant_setup.remove(session, by, "heliostat", name)
     )
 
 

@@ -19,7 +19,7 @@ from service.jobs.kinds.aim_plans import MAX_STEPS, step_name
 from service.store import queue
 from service.store.job_tables import JobRow
 from service.store.mounts import mounts_of_versions
-from service.twin.pointing.calibration import UndatedCount
+from service.twin.calibration import UndatedCount
 
 StepNumber = Annotated[
     int, Query(ge=0, lt=MAX_STEPS, description="Which step of a day, from 0; the first without it.")

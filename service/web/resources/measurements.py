@@ -45,7 +45,7 @@ from service.store.listing import Order, Period
 from service.store.measurements import MeasurementFilter
 from service.store.photographs import newest_correction
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.heliostats.metadata import spot_m
+from service.twin.photographs.metadata import spot_m
 from service.twin.photographs.repeats import receive
 from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import photograph_name

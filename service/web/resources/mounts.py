@@ -41,9 +41,9 @@ from service.twin.alarms.field_overview import (
     read_summaries,
     with_pointing,
 )
+from service.twin.calibration import CalibrationSlot, best_slot, make_plan, mount_out
 from service.twin.forecasts.requests import position_of
-from service.twin.heliostats.stored_mount import load_mount
-from service.twin.pointing.calibration import CalibrationSlot, best_slot, make_plan, mount_out
+from service.twin.stored_mount import load_mount
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     READ,

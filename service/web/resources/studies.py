@@ -47,14 +47,17 @@ from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.tables import PlantRow, StudyRow
+from service.twin import model_versions
 from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.plant import model_versions
 from service.twin.runtime import Runtime
-from service.twin.studies.changes import (
+from service.twin.studies.adoption import (
     EACH_S,
     AccuracyChange,
+    AdoptionState,
+    StudyState,
     forecast_changes,
     heliostats_to_forecast,
+    study_states,
 )
 from service.twin.studies.field_change import (
     ContradictionError,
@@ -62,7 +65,6 @@ from service.twin.studies.field_change import (
     read_field_change,
     require_no_contradiction,
 )
-from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.twin.studies.study import MAX_STUDY_IMAGES, StudyIn, Surfaces, extent_of
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,

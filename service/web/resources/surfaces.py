@@ -41,8 +41,8 @@ from service.store.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
 from service.twin.alarms.field_overview import field_totals
-from service.twin.heliostats.facets import facet_places
 from service.twin.runtime import Runtime
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.evaluation import justify_by_hand
 from service.twin.surfaces.prediction import predict_surface
 from service.web.auth.dependencies import (

@@ -31,8 +31,8 @@ from service.store.image_files import ImageStore, digest
 from service.store.job_tables import JobRow
 from service.store.keys import RESERVED
 from service.store.tables import ImageRow, MeasurementRow
+from service.twin import plant_setup
 from service.twin.photographs.ingest import ingest
-from service.twin.plant import setup
 from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from tests.service.conftest import png, properties_document, sun_at
@@ -73,7 +73,9 @@ def give(runtime: Runtime, *seeds: int) -> None:
 def give_to_another(runtime: Runtime, heliostat: str, data: bytes) -> tuple[MeasurementRow, bool]:
     """The same image, which this heliostat has, too."""
     with runtime.database.writing() as session:
-        setup.set_heliostat(session, setup.Authorship("tester"), heliostat, properties_document())
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester"), heliostat, properties_document()
+        )
     return ingest(
         runtime,
         heliostat,
@@ -324,7 +326,9 @@ def test_image_of_two_photographs_is_accepted_where_one_is(runtime: Runtime):
         row = session.scalars(
             select(MeasurementRow).where(MeasurementRow.image_sha256 == digest(picture(50)))
         ).one()
-        setup.set_heliostat(session, setup.Authorship("tester"), "AB38", properties_document())
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester"), "AB38", properties_document()
+        )
         heliostat, target = store.get_heliostat(session, "AB38"), store.get_target(session, "lower")
         image = session.get_one(ImageRow, row.image_sha256)
         again = MeasurementRow(

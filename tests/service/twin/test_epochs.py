@@ -16,8 +16,9 @@ from service.store.decisions import Justification
 from service.store.mounts import CalibrationState
 from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatStateRow
-from service.twin.pointing.calibration import _reason
-from service.twin.surfaces.epochs import (
+from service.twin.calibration import _reason
+from service.twin.surfaces.prediction import _begin_of_epoch
+from service.twin.surfaces.present_shape import (
     FALL,
     AccuracyFall,
     Epoch,
@@ -26,7 +27,6 @@ from service.twin.surfaces.epochs import (
     find_accuracy_fall,
     waiting_epochs,
 )
-from service.twin.surfaces.prediction import _begin_of_epoch
 from tests.service.conftest import ORIGIN, properties_document
 from tests.service.store.rows import PLANE, new
 from tests.service.studies import add as add_study

@@ -30,12 +30,12 @@ from service.sources.folder import read_folder, read_surface
 from service.sources.photograph import IncomingPhotograph
 from service.store.mounts import add_mount
 from service.store.surface_versions import NewSurface
-from service.twin.heliostats.measurements import load_heliostat_context
+from service.twin import model_versions
+from service.twin.exporting import export_folder
+from service.twin.importing import import_folder
+from service.twin.measurements import load_heliostat_context
 from service.twin.photographs.ingest import ingest
-from service.twin.plant import model_versions
 from service.twin.runtime import Runtime
-from service.twin.transfer.exporting import export_folder
-from service.twin.transfer.importing import import_folder
 from service.web.app import create_app
 from tests.conftest import made_once
 from tests.service.conftest import (

@@ -13,9 +13,9 @@ from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store import audit
 from service.store.tables import DriftRow
-from service.twin.plant import model_versions
+from service.twin import model_versions
+from service.twin.importing import import_folder
 from service.twin.runtime import Runtime
-from service.twin.transfer.importing import import_folder
 from tests.service.conftest import paint_measurement, properties_document, tower_document
 
 

@@ -32,7 +32,7 @@ from service.store.columns import now
 from service.store.image_files import digest
 from service.store.job_tables import JobRow
 from service.store.tables import ImageRow
-from service.twin.transfer import importing
+from service.twin import importing
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (

@@ -13,8 +13,8 @@ from service import store
 from service.base.settings import Settings
 from service.store import queue
 from service.store.mounts import CalibrationState
+from service.twin import calibration
 from service.twin.caches import RecentResults
-from service.twin.pointing import calibration
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (

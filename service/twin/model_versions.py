@@ -40,8 +40,7 @@ from service.store.model_versions import (
     version_name,
 )
 from service.store.tables import ModelRow, StudyRow
-from service.twin.plant.adoption_rules import names_of, why_refused
-from service.twin.plant.open_questions import open_questions
+from service.twin.adoption_rules import names_of, open_questions, why_refused
 
 __all__ = [
     "DECLARED",

@@ -26,12 +26,12 @@ from service.store import mounts
 from service.store.columns import now
 from service.store.mounts import CalibrationState
 from service.store.tables import HeliostatRow, MeasurementRow, MountRow
-from service.twin.heliostats.measurements import spot_position
-from service.twin.heliostats.metadata import photograph_from_row
-from service.twin.heliostats.stored_mount import load_mount, mount_of, true_sun, with_drive_zeros
-from service.twin.plant import model_versions
+from service.twin import model_versions
+from service.twin.measurements import spot_position
+from service.twin.photographs.metadata import photograph_from_row
 from service.twin.runtime import Runtime
-from service.twin.surfaces.epochs import Epoch, waiting_epochs
+from service.twin.stored_mount import load_mount, mount_of, true_sun, with_drive_zeros
+from service.twin.surfaces.present_shape import Epoch, waiting_epochs
 
 Array = NDArray[np.float64]
 

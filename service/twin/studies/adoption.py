@@ -1,20 +1,86 @@
-"""What adopting the result of a study would change in forecasts, before it is adopted."""
+"""Adoption of studies: what became of them, what to know before, and what it would change."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from statistics import fmean
+from typing import Literal
+
+from sqlalchemy.orm import Session
 
 from model.surface import control_points
 from service import store
 from service.base.errors import SKIPPED, NotFoundError
 from service.base.fields import Sun
-from service.store.tables import StudyRow
+from service.store.results import StudyFindings
+from service.store.tables import ModelRow, StudyRow
+from service.twin import model_versions
+from service.twin.adoption_rules import OpenQuestion, names_of, open_questions, why_refused
 from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
-from service.twin.heliostats.measurements import heights_of, load_heliostat_context
+from service.twin.measurements import heights_of, load_heliostat_context
 from service.twin.operations import Forecast
-from service.twin.plant import model_versions
 from service.twin.runtime import Runtime
+
+AdoptionState = Literal["active", "replaced", "withdrawn", "candidate", "nothing_to_adopt"]
+
+
+@dataclass(frozen=True)
+class StudyState:
+    """A study's findings, and the newest version adopted from it.
+
+    ``state`` is "replaced" if a later version is current. ``warnings`` are the conflicts that
+    adoption by force ignores. ``current`` is the number of the current version. ``refusal`` says
+    why it cannot be adopted, None if it can. ``adopts`` names what adoption adds.
+    """
+
+    findings: StudyFindings
+    version: ModelRow | None
+    state: AdoptionState
+    questions: list[OpenQuestion]
+    warnings: list[str]
+    current: int
+    refusal: str | None
+    adopts: list[str]
+
+    @property
+    def is_adoptable(self) -> bool:
+        """Whether it can be adopted, and is not."""
+        return self.refusal is None and self.state in ("candidate", "withdrawn")
+
+    @property
+    def adopted(self) -> int | None:
+        """Number of the version that was adopted from it, unless it is withdrawn."""
+        return None if self.version is None or self.version.withdrawn_at else self.version.number
+
+
+def study_states(session: Session, rows: Sequence[StudyRow]) -> dict[int, StudyState]:
+    """The states of studies, by id."""
+    numbers = [row.id for row in rows]
+    findings, current = (
+        store.study_findings(session, numbers),
+        model_versions.current_number(session),
+    )
+    versions = model_versions.newest_of(session, numbers)
+    return {row.id: _state(row, findings[row.id], versions.get(row.id), current) for row in rows}
+
+
+def _state(
+    row: StudyRow, findings: StudyFindings, version: ModelRow | None, current: int
+) -> StudyState:
+    refusal = why_refused(findings)
+    state: AdoptionState = "candidate" if refusal is None else "nothing_to_adopt"
+    if version is not None:
+        is_active = version.number == current
+        state = "withdrawn" if version.withdrawn_at else "active" if is_active else "replaced"
+    warnings = []
+    if row.model != current:
+        warnings.append(
+            f"it was made with version {row.model} of the model, and would replace version"
+            f" {current}, which is current"
+        )
+    questions, adopts = open_questions(findings), names_of(findings)
+    return StudyState(findings, version, state, questions, warnings, current, refusal, adopts)
+
 
 MAX_HELIOSTATS = 12
 """Most heliostats whose forecasts are computed."""

@@ -39,10 +39,10 @@ from service.store.columns import EPOCH
 from service.store.measurements import EXCLUDED
 from service.store.model_versions import declared_of, find_current
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.metadata import photograph_from_row
+from service.twin import history
+from service.twin.photographs.metadata import photograph_from_row
 from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import photograph_name
-from service.twin.transfer import history
 
 
 class _Writer:
@@ -78,7 +78,7 @@ def export_folder(
     """Write all data that cannot be computed again to a new folder.
 
     Return the numbers of files, and what was left out. PAINT's layout holds plant, heliostats,
-    original photographs and the measured surface. `service.twin.transfer.history` holds the rest. A
+    original photographs and the measured surface. `service.twin.history` holds the rest. A
     predicted active surface is in the folder ``surfaces``, because in PAINT's place it would be
     taken for a measured one.
 

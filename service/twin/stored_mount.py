@@ -1,4 +1,4 @@
-"""Stored heliostats on their calibrated mounts, for motors, images and studies.
+"""Stored heliostats: their calibrated mounts for motors, images and studies, and their facets.
 
 A stored mount is valid as long as the heliostat's properties and the model's sun effects are those
 of its calibration.
@@ -21,11 +21,12 @@ from model.pointing.kinematics import apply_parameters
 from model.pointing.report import day_of, mount_from_json, parameters_from_json, sun_to_json
 from service import store
 from service.base.errors import ConflictError
+from service.drawing.facets import FacetPlaces
 from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
 from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
-from service.twin.plant import model_versions
+from service.twin import model_versions
 
 Array = NDArray[np.float64]
 
@@ -198,3 +199,16 @@ def as_calibrated(row: HeliostatRow, mount: MountRow | None, model: PlantModel) 
         heliostat,
         mount=replace(apply_parameters(heliostat.mount, parameters), calibrated_until=until),
     )
+
+
+def facet_places(
+    heliostat: HeliostatRow, origin: tuple[float, float, float], count: int
+) -> FacetPlaces:
+    """Places of the ``count`` facets of a surface; ``origin`` is the tower base in WGS84.
+
+    They are in rows if the heliostat has another number of facets since.
+    """
+    mirror = read_heliostat(heliostat.name, heliostat.properties, np.array(origin), STORED)
+    if len(mirror.facets) != count:
+        return FacetPlaces.in_rows(count, heliostat.size_m)
+    return FacetPlaces.of(mirror)

@@ -24,9 +24,9 @@ from service import store
 from service.base.errors import ServiceError
 from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
-from service.twin.heliostats.stored_mount import StoredMount, stored_mount
-from service.twin.pointing.calibration import load_readings
+from service.twin.calibration import load_readings
 from service.twin.runtime import Runtime
+from service.twin.stored_mount import StoredMount, stored_mount
 from service.twin.surfaces.accuracy import result_key
 
 Array = NDArray[np.float64]

@@ -28,9 +28,9 @@ from service.sources.juelich import CENTERED_SIZE_ERROR
 from service.store import mounts
 from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.stored_mount import as_calibrated
-from service.twin.plant import model_versions
-from service.twin.plant.model_versions import ModelVersion
+from service.twin import model_versions
+from service.twin.model_versions import ModelVersion
+from service.twin.stored_mount import as_calibrated
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")

@@ -1,14 +1,21 @@
-"""Metadata of a photograph: as submitted, as stored, and as it could be sent."""
+"""Metadata of a photograph, as submitted, as stored, and as it could be sent; warnings of them.
+
+Warnings are documents with ``type``, ``detail`` and figures.
+"""
 
 from collections.abc import Sequence
 from typing import Any, cast
 
-from model.frames import wgs84_to_enu
+import numpy as np
+from numpy.typing import ArrayLike
+
+from model.ephemeris import SunContradiction, clock_faults
+from model.frames import sun_direction, wgs84_to_enu
 from model.imaging import ImageKind
 from model.pointing import Weather
 from model.times import format_time
 from service.sources.photograph import IncomingPhotograph
-from service.store.tables import NO_IMAGE, MeasurementRow
+from service.store.tables import NO_IMAGE, SUN_CONTRADICTS_TIME, MeasurementRow
 
 
 def spot_m(wgs84: Sequence[float] | None, origin: tuple[float, float, float]) -> list[float] | None:
@@ -68,3 +75,53 @@ def photograph_with_target(known: Any, target: str) -> IncomingPhotograph:
         weather=Weather.of(known),
         forced=known.forced,
     )
+
+
+Warnings = list[dict[str, object]]
+
+
+def find_sun_contradictions(
+    photographs: Sequence[IncomingPhotograph], origin: ArrayLike
+) -> list[SunContradiction | None]:
+    """Compare the recorded suns with their positions at the recorded times.
+
+    None if they agree or the time is unknown. ``origin`` is the tower base in WGS84.
+    """
+    dated = [one for one in photographs if one.taken_at is not None]
+    suns = [sun_direction(one.sun.azimuth_deg, one.sun.elevation_deg) for one in dated]
+    moments = [one.taken_at for one in dated if one.taken_at is not None]
+    temperatures = [one.weather.temperature_c for one in dated]
+    faults = iter(clock_faults(np.array(suns), moments, origin, temperatures))
+    return [None if one.taken_at is None else next(faults) for one in photographs]
+
+
+def sun_warnings(contradiction: SunContradiction | None) -> Warnings:
+    """The warning of a sun that contradicts its time, or none."""
+    if contradiction is None:
+        return []
+    found = {"angle_deg": round(contradiction.angle_deg, 3), "clock_ahead_h": contradiction.ahead_h}
+    return [{"type": SUN_CONTRADICTS_TIME, "detail": contradiction.detail, **found}]
+
+
+def other_warnings(row: MeasurementRow, photograph: IncomingPhotograph) -> Warnings:
+    """Stored warnings except the sun's.
+
+    There are none if ``photograph`` has another sun or target, because they depend on these.
+    """
+    if (row.target.name, row.sun) != (photograph.target, photograph.sun):
+        return []
+    return [one for one in row.warnings or () if one["type"] != SUN_CONTRADICTS_TIME]
+
+
+def sun_columns(
+    row: MeasurementRow, photograph: IncomingPhotograph, contradiction: SunContradiction | None
+) -> dict[str, object]:
+    """The columns of a stored measurement that depend on its time and sun.
+
+    Time and sun are those of ``photograph``, with their ``contradiction``, if any.
+    """
+    warnings = [*sun_warnings(contradiction), *other_warnings(row, photograph)]
+    return {
+        "quality": {**row.quality, "clock": contradiction and contradiction.detail},
+        "warnings": warnings or None,
+    }

@@ -59,8 +59,8 @@ from service.store.tables import (
     SurfaceRow,
     TargetRow,
 )
-from service.twin.heliostats.metadata import photograph_with_target
 from service.twin.photographs.ingest import position_row
+from service.twin.photographs.metadata import photograph_with_target
 
 FOLDER = "history"
 

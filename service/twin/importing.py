@@ -31,12 +31,11 @@ from service.sources.files import read_file
 from service.sources.folder import MeasurementFolder, measured_heights
 from service.sources.photograph import IncomingPhotograph
 from service.store.keys import RESERVED
-from service.twin.heliostats.metadata import photograph_with_target
+from service.twin import history, plant_setup
+from service.twin.photographs.metadata import photograph_with_target
 from service.twin.photographs.repeats import receive
-from service.twin.plant import setup
 from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import import_surface
-from service.twin.transfer import history
 
 UNREADABLE = (
     InvalidInputError,
@@ -198,7 +197,7 @@ def _put_plant(runtime: Runtime, folder: MeasurementFolder, actor: str) -> Count
     plant, has_history = folder.plant, (folder.root / history.PLANT).exists()
     declared = None if has_history else folder.declared()
     changes = runtime.database.run_in_transaction(
-        lambda session: setup.set_plant(
+        lambda session: plant_setup.set_plant(
             session, _authorship(folder, actor), plant, declared, facts=folder.facts
         )
     )
@@ -215,14 +214,14 @@ def _put_heliostat(runtime: Runtime, folder: MeasurementFolder, name: str, actor
 
     def put(session: Session) -> list[str]:
         by = _authorship(folder, actor)
-        _, change = setup.set_heliostat(session, by, name, folder.properties[name])
+        _, change = plant_setup.set_heliostat(session, by, name, folder.properties[name])
         return [f"heliostats {change}"]
 
     return runtime.database.run_in_transaction(put)
 
 
-def _authorship(folder: MeasurementFolder, actor: str) -> setup.Authorship:
-    return setup.Authorship(actor, f"import of {folder.root.name}"[:200])
+def _authorship(folder: MeasurementFolder, actor: str) -> plant_setup.Authorship:
+    return plant_setup.Authorship(actor, f"import of {folder.root.name}"[:200])
 
 
 def _measured_surface(folder: MeasurementFolder, name: str) -> store.NewSurface | None:
