@@ -28,7 +28,7 @@ from model.setup import Setup
 from service import store
 from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasuredSurface, MeasurementFolder, points_of
-from service.sources.juelich import CENTERED_WINDOW
+from service.sources.photograph import CENTERED_WINDOW
 from service.store.tables import NO_IMAGE, MeasurementRow
 from service.twin import operations
 from service.twin.calibration import motors_of

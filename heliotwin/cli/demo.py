@@ -42,8 +42,13 @@ from service.base.fields import Sun
 from service.base.progress import no_progress
 from service.base.settings import Settings
 from service.drawing.facets import FacetPlaces
-from service.drawing.pictures import comparison_picture, flux_picture, of_peak, surface_picture
-from service.drawing.plant_picture import plant_picture
+from service.drawing.pictures import (
+    comparison_picture,
+    flux_picture,
+    of_peak,
+    plant_picture,
+    surface_picture,
+)
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, read_folder
 from service.sources.plant_file import read_plant

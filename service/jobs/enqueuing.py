@@ -1,7 +1,6 @@
 """Creation and cancellation of jobs, for users or by the service itself."""
 
-from service.jobs.common import require_stored
-from service.jobs.kind import Kind, Kinds, Payload
+from service.jobs.kind import Kind, Kinds, Payload, require_stored
 from service.jobs.uploads import delete_unused_uploads
 from service.store import audit
 from service.store.job_tables import JobRow

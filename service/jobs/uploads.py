@@ -22,8 +22,7 @@ from model.errors import InvalidInputError
 from service.base.errors import ConflictError, NotFoundError, StoreFullError, TooManyError
 from service.base.processes import file_lock
 from service.base.settings import Settings
-from service.sources.archive import unpack_archive
-from service.sources.files import confined_to
+from service.sources.files import confined_to, unpack_archive
 from service.sources.folder import read_folder
 from service.store import audit
 from service.store.columns import now

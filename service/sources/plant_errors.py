@@ -20,7 +20,7 @@ from service.sources.plant_schema import (
     SunEntry,
     nearest,
 )
-from service.sources.yaml_text import KeyPath, YamlDocument, read_yaml
+from service.sources.text_lines import KeyPath, YamlDocument, read_yaml
 
 # Forms of a value besides its words, for the message of a word that is none of them.
 _OTHER_FORMS = {

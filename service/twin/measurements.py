@@ -24,7 +24,7 @@ from model.surface import DEGREE
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
-from service.sources.juelich import CENTERED_SIZE_ERROR
+from service.sources.photograph import CENTERED_SIZE_ERROR
 from service.store import mounts
 from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow

@@ -27,7 +27,7 @@ from model.tracing.convolution import Rays, central_rays
 from model.tracing.scene import irradiance_of
 from model.tracing.superposition import Beams
 from service.base.choices import Method, require_images
-from service.sources.juelich import CENTERED_WINDOW, mark_layouts
+from service.sources.photograph import CENTERED_WINDOW, mark_layouts
 
 __all__ = [
     "Forecast",

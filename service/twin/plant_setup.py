@@ -18,7 +18,7 @@ from service import store
 from service.base.fields import JsonObject
 from service.base.plant import NAMES_WITH_UNITS, NO_FACTS, PlantFacts
 from service.sources.documents import read_heliostat
-from service.sources.heliostat_of_type import HeliostatOfType, document_of
+from service.sources.heliostat_document import HeliostatOfType, document_of
 from service.sources.paint_documents import Corners
 from service.store import Change, audit
 from service.store.columns import Base

@@ -73,7 +73,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Draw a plant: the field from above, and tower, receivers and targets from the side."""
-    from service.drawing.plant_picture import plant_picture
+    from service.drawing.pictures import plant_picture
     from service.sources.plant_file import read_plant
 
     require_file(out)

@@ -41,8 +41,7 @@ from service.base.fields import (
     parse_moment,
 )
 from service.base.processes import return_memory
-from service.jobs.common import MAX_PIXELS, require_some
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import MAX_PIXELS, Context, Kind, Result, require_some
 from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
 from service.store import queue

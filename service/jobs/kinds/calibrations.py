@@ -6,8 +6,7 @@ from pydantic import Field
 
 from model.pointing.report import clock_to_json
 from service.base.fields import Model, Moment
-from service.jobs.common import Heliostats, chosen_names
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import Context, Heliostats, Kind, Result, chosen_names
 from service.twin.calibration import calibrate_store, store_mounts
 
 

@@ -14,8 +14,15 @@ from model.fleet import LOSSES, FleetFlux, Losses
 from model.plant import Receiver
 from service import store
 from service.base.fields import AnySun, Flag, ModelVersion, Name, Position, Resolution
-from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import (
+    Context,
+    Heliostats,
+    Kind,
+    Result,
+    chosen_names,
+    count_chosen,
+    require_some,
+)
 from service.store import queue
 from service.twin import model_versions
 from service.twin.alarms.measured_states import read_mirror_states

@@ -27,7 +27,7 @@ from service.sources.documents import (
 from service.sources.folder import Importer, MeasurementFolder, read_declared
 from service.sources.plant_errors import PlantText
 from service.sources.plant_formats.imported import PLANT
-from service.sources.plant_types import types_to_json
+from service.sources.plant_parts import types_to_json
 
 
 @dataclass(frozen=True, eq=False)

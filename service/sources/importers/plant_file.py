@@ -26,7 +26,7 @@ from service.sources.folder import Importer, MeasurementFolder, declared_json
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.imported import PLANT
-from service.sources.plant_types import types_to_json
+from service.sources.plant_parts import types_to_json
 from service.sources.schema import WeatherDocument, parse, parse_time
 
 _ENDING = "-calibration-properties.json"

@@ -19,8 +19,7 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline
-from service.sources.heliostat_document import HeliostatDocument
-from service.sources.heliostat_of_type import HeliostatOfType
+from service.sources.heliostat_document import HeliostatDocument, HeliostatOfType
 from service.sources.schema import HeliostatProperties
 from service.store import acknowledgements, audit, decisions, mounts
 from service.store.decisions import Justification, find_comparison

@@ -41,7 +41,7 @@ from service.base.fields import (
     start_of_day,
 )
 from service.base.names import LINE
-from service.drawing.discrepancy_chart import amount_charts
+from service.drawing.study_charts import amount_charts
 from service.drawing.study_report import VERDICTS, report_page
 from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
