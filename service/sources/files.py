@@ -18,7 +18,7 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from model.errors import InvalidInputError
 from service.base.errors import TooLargeError
-from service.base.names import escape_control_characters
+from service.base.validation import escape_control_characters
 
 # The largest files of a measurement folder are deflectometry, some tens of megabytes.
 _MAX_BYTES = 2**30

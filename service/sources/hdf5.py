@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from model.plant import Heliostat
 from model.surface import COLUMNS, ROWS, fit_heights, nominal_heights
-from service.base.names import escape_control_characters
+from service.base.validation import escape_control_characters
 from service.sources.files import file_name, require_regular
 
 Array = NDArray[np.float64]

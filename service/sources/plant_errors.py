@@ -11,7 +11,7 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from model.errors import InvalidInputError, ModelError
-from service.base.validation_messages import message_of
+from service.base.validation import message_of
 from service.sources.plant_schema import (
     Drive,
     KeyMistakeError,

@@ -23,8 +23,8 @@ from pydantic import (
 from model.actuator import LinearActuator
 from model.plant import require_cylinder_shape
 from service.base.fields import Extent, Flag, Metres, Model, Name, Number, Plane, Position, Whole
-from service.base.names import LINE, NAME
 from service.base.plant import NAMES_WITH_UNITS, PlaneReceiverIn, TowerSize
+from service.base.validation import LINE, NAME
 
 MAX_HELIOSTATS = 50_000
 """Most heliostats of a plant."""

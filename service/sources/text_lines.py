@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from model.errors import InvalidInputError
-from service.base.names import is_text
+from service.base.validation import is_text
 from service.sources.files import file_name, read_text
 
 MAX_BYTES = 2**26

@@ -26,7 +26,7 @@ from model.errors import InvalidInputError
 from service.base.errors import ConflictError, StoreDamagedError
 from service.base.progress import Progress, no_progress
 from service.base.settings import Settings
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.store.database import Database
 from service.store.image_files import ImageStore
 

@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ColumnElement, Select, Text, cast, func, select
 from sqlalchemy.orm import Session, undefer
 
-from service.base import names
+from service.base import validation
 from service.base.errors import ConflictError, NotFoundError
 from service.store import sizes
 from service.store.columns import now
@@ -273,7 +273,7 @@ def add_alias(
     ConflictError
         If another image of the heliostat has this id.
     """
-    names.require_name(names.IDENTIFIER, external_id, "id")
+    validation.require_name(validation.IDENTIFIER, external_id, "id")
     holder = find_measurement(session, heliostat, external_id)
     if holder is row:
         return False
@@ -327,7 +327,7 @@ def _keep_image(session: Session, image: ImageRow, accepted: bool) -> Added[Imag
 def _check_and_lock(session: Session, heliostat: HeliostatRow, row: MeasurementRow) -> None:
     """Check the id of a new measurement, and lock its heliostat and its target."""
     if row.external_id is not None:
-        names.require_name(names.IDENTIFIER, row.external_id, "id")
+        validation.require_name(validation.IDENTIFIER, row.external_id, "id")
     lock_heliostat(session, heliostat)
     lock_row(session, TargetRow, row.target_id, "its target")
 

@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session, defer
 
 from model.locating import locator_from_json, locator_to_json
 from model.plant import Receiver, TargetPlane, Tower
-from service.base import names
+from service.base import validation
 from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import JsonObject
 from service.base.plant import (
@@ -173,7 +173,7 @@ def put_heliostat(
         Without ``replace``, if a heliostat of this name has other properties, even from a
         concurrent writer.
     """
-    names.require_name(names.NAME, name, "heliostat")
+    validation.require_name(validation.NAME, name, "heliostat")
     east, north, up = floats(position)
     values = {"properties": properties, "east_m": east, "north_m": north, "up_m": up}
     row, is_new = insert_or_find(session, HeliostatRow(name=name, **values))
@@ -228,7 +228,7 @@ def put_target(
     ConflictError
         If a receiver has this name.
     """
-    names.require_name(names.NAME, plane.name, "target")
+    validation.require_name(validation.NAME, plane.name, "target")
     if find_receiver(session, plane.name) is not None:
         raise ConflictError(
             f"name: {plane.name} is a receiver; choose another name for the target plane"
@@ -297,7 +297,7 @@ def put_receiver(session: Session, receiver: Receiver) -> Put[ReceiverRow]:
     ConflictError
         If a target has this name.
     """
-    names.require_name(names.NAME, receiver.name, "receiver")
+    validation.require_name(validation.NAME, receiver.name, "receiver")
     document = receiver_to_json(receiver)
     if find_target(session, receiver.name) is not None:
         raise ConflictError(

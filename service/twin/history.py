@@ -38,7 +38,7 @@ from service.base.fields import (
     Wgs84,
     from_row,
 )
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.sources.documents import parse_declared, read_json
 from service.sources.files import read_file
 from service.store import audit

@@ -24,8 +24,8 @@ from service.base.errors import (
     UnsupportedImageError,
     list_reasons,
 )
-from service.base.names import escape_control_characters
 from service.base.progress import Progress, no_progress
+from service.base.validation import escape_control_characters
 from service.sources.documents import IMAGE_KINDS
 from service.sources.files import read_file
 from service.sources.folder import MeasurementFolder, measured_heights

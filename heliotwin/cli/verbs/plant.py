@@ -106,7 +106,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Make a plant of another program's file; notes say what the file leaves open."""
-    from service.base.names import counted
+    from service.base.validation import counted
     from service.sources.plant_formats.formats import import_plant
 
     require_folder(out)

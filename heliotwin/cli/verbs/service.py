@@ -76,7 +76,7 @@ def serve(
     another.
     """
     from service.base.settings import Settings
-    from service.web import server
+    from service.web.app import serve as serve_app
 
     keep_private()
     given = {"host": host, "port": port}
@@ -89,7 +89,7 @@ def serve(
         else:
             console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
 
-    server.serve(settings, say)
+    serve_app(settings, say)
 
 
 @app.command()

@@ -46,15 +46,17 @@ from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
 from service.store import queue
 from service.store.tables import HeliostatRow
-from service.twin.forecasts.aim_sources import SOURCES, plant_time_zone, sources_of
 from service.twin.forecasts.aims import (
     ROWS,
+    SOURCES,
     AimDrives,
     aim_figures,
     begin_at,
     excess_of,
     no_drive,
     places_on,
+    plant_time_zone,
+    sources_of,
 )
 from service.twin.forecasts.field_forecast import (
     Fleet,

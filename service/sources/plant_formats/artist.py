@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from service.base.names import NAME, counted, require_name
+from service.base.validation import NAME, counted, require_name
 from service.sources.folder import MeasuredSurface
 from service.sources.hdf5 import Hdf5Group, open_hdf5
 from service.sources.plant_formats.artist_heliostats import (

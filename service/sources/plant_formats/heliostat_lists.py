@@ -14,7 +14,7 @@ import re
 from pathlib import Path
 
 from model.errors import InvalidInputError
-from service.base.names import NAME, require_name
+from service.base.validation import NAME, require_name
 from service.sources.plant_formats.imported import (
     ImportedPlant,
     facing,

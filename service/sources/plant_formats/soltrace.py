@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.base.names import NAME, counted
+from service.base.validation import NAME, counted
 from service.sources.files import file_name, read_text, require_regular
 from service.sources.plant_formats.imported import (
     FacetedMirror,

@@ -51,7 +51,7 @@ from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview,
 from service.twin.alarms.measured_states import LostLight, find_lost_light, measure_states
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, ReasonOf, SeverityOf
-from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
+from service.twin.forecasts.aims import outdated_plans, plant_time_zone
 from service.twin.forecasts.mirror_states import MirrorStates
 from service.twin.pointing_errors import DriveStep, PointingState
 from service.twin.studies.cameras import FIGURES, CameraChange, CameraReadings

@@ -32,7 +32,7 @@ from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import Reason
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.surfaces.accuracy import (
     PhotographComparison,
     photograph_name,

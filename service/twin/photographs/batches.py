@@ -17,7 +17,7 @@ from model.errors import InvalidInputError, ModelError
 from model.times import format_time
 from service.base.errors import ConflictError, InvalidEntriesError, NotFoundError, ServiceError
 from service.base.fields import Moment, read_time
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.sources.text_lines import ForeignLine, csv_lines
 from service.store import audit
 from service.store.job_tables import AuditRow

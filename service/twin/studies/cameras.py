@@ -33,7 +33,7 @@ from service.store.columns import now
 from service.store.database import Database
 from service.store.job_tables import JobRow
 from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow, TargetRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.measurements import (
     Array,
     HeliostatContext,

@@ -26,7 +26,7 @@ from service.base.arrays import to_json_value
 from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
 from service.base.fields import Model, Moment, Name, StudyReport, Text, Whole
 from service.base.progress import NamedSteps, Report, no_report
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.drawing.study_report import study_body
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow

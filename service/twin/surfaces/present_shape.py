@@ -44,7 +44,7 @@ from service.store.tables import (
     SurfaceRow,
 )
 from service.twin import model_versions
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.measurements import choose_diverse
 from service.twin.runtime import Operations
 

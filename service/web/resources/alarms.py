@@ -58,10 +58,9 @@ from service.web.auth.dependencies import (
     RuntimeDep,
     require_json,
 )
-from service.web.responses.csv_tables import sheet_answer
+from service.web.responses.lists import AfterId, Page, page, sheet_answer
 from service.web.responses.openapi import problems
 from service.web.responses.pages import count_badge, go_to, render
-from service.web.responses.paging import AfterId, Page, page
 
 router = APIRouter(prefix="/alarms", tags=["alarms"])
 pages = APIRouter(include_in_schema=False)

@@ -42,7 +42,7 @@ from service.store.columns import EPOCH
 from service.store.listing import EVER, NEWEST_FIRST, Period
 from service.store.tables import HeliostatRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import trace_request
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.operations import Forecast

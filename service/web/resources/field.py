@@ -32,7 +32,7 @@ from service.twin.alarms.field_filter import (
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
 from service.twin.alarms.reasons import SEVERITIES, AlarmCount
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OVERVIEW_SLOT,
@@ -42,10 +42,9 @@ from service.web.auth.dependencies import (
     RuntimeDep,
 )
 from service.web.resources.alarms import AlarmCountDep
-from service.web.responses.csv_tables import sheet_answer
+from service.web.responses.lists import Page, page, sheet_answer
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import Page, page
 
 
 class FieldQuery(HeliostatFilter):

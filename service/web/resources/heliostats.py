@@ -50,7 +50,7 @@ from service.twin.alarms.field_overview import (
     with_pointing,
 )
 from service.twin.calibration import CalibrationSlot, best_slot
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.plant_setup import Authorship
 from service.twin.stored_mount import facet_places
 from service.twin.surfaces.accuracy import ComparisonResult, rank_of
@@ -79,9 +79,9 @@ from service.web.resources.heliostat_figures import (
     version_marks,
     versions,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
-from service.web.responses.paging import Page, page
 
 _FORMS = {
     "heliostat_position": "(paint)",

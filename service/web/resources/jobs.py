@@ -25,7 +25,7 @@ from model.fleet import LOSSES
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
 from service.base.fields import Rows, State, Version
-from service.base.names import KEY
+from service.base.validation import KEY
 from service.drawing.charts import HeatMap
 from service.drawing.pictures import flux_picture
 from service.drawing.templates import in_zone
@@ -65,13 +65,12 @@ from service.web.resources.job_results import (
     payload_in_words,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
+from service.web.responses.lists import ListQuery, OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import TEXT, arrays, problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import ListQuery, OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 
 async def _watchers(request: Request) -> Watchers:

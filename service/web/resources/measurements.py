@@ -63,12 +63,11 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.files import WholeFile, etag_matches
 from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.lists import OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import BINARY, arrays, problems
-from service.web.responses.paging import OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 Motors = Annotated[
     tuple[Annotated[Number, Field(ge=-1e9, le=1e9)], Annotated[Number, Field(ge=-1e9, le=1e9)]],

@@ -11,8 +11,8 @@ from service.store.model_versions import declared_of
 from service.store.tables import ModelRow
 from service.twin import model_versions
 from service.web.auth.dependencies import READ, RuntimeDep
+from service.web.responses.lists import Page
 from service.web.responses.openapi import problems
-from service.web.responses.paging import Page
 
 router = APIRouter(tags=["studies"])
 

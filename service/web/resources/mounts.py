@@ -54,9 +54,9 @@ from service.web.auth.dependencies import (
     ZoneDep,
     require_json,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
-from service.web.responses.paging import Page, page
 
 router = APIRouter(tags=["mounts"])
 pages = APIRouter(include_in_schema=False)

@@ -31,9 +31,12 @@ from service.twin.photographs.corrections import (
     NothingToChangeError,
     correct_photograph,
 )
-from service.twin.photographs.deletion import delete_photograph
-from service.twin.photographs.display import load_for_display, pixels_of
 from service.twin.photographs.metadata import stored_metadata
+from service.twin.photographs.stored_photograph import (
+    delete_photograph,
+    load_for_display,
+    pixels_of,
+)
 from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,

@@ -34,7 +34,7 @@ from service.base.fields import (
     parse_moment,
     start_of_day,
 )
-from service.base.names import IDENTIFIER
+from service.base.validation import IDENTIFIER
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.listing import Period
@@ -48,7 +48,7 @@ from service.store.photographs import (
     newest_correction,
 )
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.requests import position_of
 from service.twin.photographs.corrections import (
     GivenCorrection,
@@ -73,9 +73,9 @@ from service.web.resources.measurements import (
     TakenQuery,
     measurement_out,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import Page, page
 
 router = APIRouter(prefix="/measurements", tags=["measurements"])
 pages = APIRouter(include_in_schema=False)

@@ -30,7 +30,7 @@ from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
 from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
 from service.twin.runtime import Runtime

@@ -52,9 +52,9 @@ from service.web.auth.dependencies import (
     require_json,
     set_tag,
 )
+from service.web.responses.lists import Page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to_job, render
-from service.web.responses.paging import Page
 
 Place = tuple[float, float, float]
 """East, north and up."""

@@ -40,15 +40,14 @@ from service.base.fields import (
     from_row,
     start_of_day,
 )
-from service.base.names import LINE
+from service.base.validation import LINE
 from service.drawing.study_charts import amount_charts
 from service.drawing.study_report import VERDICTS, report_page
-from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.tables import PlantRow, StudyRow
 from service.twin import model_versions
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.runtime import Runtime
 from service.twin.studies.adoption import (
     EACH_S,
@@ -74,11 +73,12 @@ from service.web.auth.dependencies import (
     IdentityDep,
     RuntimeDep,
 )
+from service.web.resources.job_results import study_timelines
+from service.web.resources.job_start import study_cost
 from service.web.resources.models import ModelOut, current_out, model_out
-from service.web.resources.study_charts import study_timelines
+from service.web.responses.lists import ListQuery, OrderQuery, Page, page
 from service.web.responses.openapi import TEXT, problems
 from service.web.responses.pages import go_to, go_to_job, named_by_field, render
-from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 
 router = APIRouter(tags=["studies"])
 pages = APIRouter(include_in_schema=False)

@@ -60,12 +60,11 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.lists import AfterId, OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to
-from service.web.responses.paging import AfterId, OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 
 class SurfaceIn(Model):

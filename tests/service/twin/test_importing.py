@@ -8,8 +8,8 @@ from sqlalchemy import select
 
 from model.sunshape import Pillbox
 from service import store
-from service.base.names import is_text
 from service.base.settings import Settings
+from service.base.validation import is_text
 from service.sources.folder import read_folder
 from service.store import audit
 from service.store.tables import DriftRow

@@ -10,7 +10,7 @@ import pytest
 from model.errors import InvalidInputError
 from model.plant import Heliostat, MirrorOptics
 from service.twin.alarms.measured_states import predicted_pointing_error
-from service.twin.forecasts.aim_sources import has_other_state
+from service.twin.forecasts.aims import has_other_state
 from service.twin.forecasts.mirror_states import (
     AS_DECLARED,
     STATE_COLUMNS,

@@ -1,4 +1,4 @@
-"""Display of a photograph: pixels, target outline, and comparison with the forecast."""
+"""A stored photograph: its pixels, target outline, comparison with the forecast, and deletion."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from service import store
 from service.base.errors import NotFoundError
 from service.sources.decode import Pixels
+from service.store import deletion, image_files
+from service.store.deletion import Deleted
 from service.store.tables import MeasurementRow
 from service.twin.measurements import load_heliostat_context
 from service.twin.photographs.ingest import MeasuredImage, measure_stored
@@ -55,3 +57,28 @@ def compare_one(runtime: Runtime, heliostat: str, identifier: str) -> Photograph
             f"measurement {identifier} was refused ({row.reason}), so it has no flux"
         )
     return compare_with(runtime, twin, surface, [row])[0]
+
+
+def delete_photograph(
+    runtime: Runtime,
+    heliostat: str,
+    identifier: str,
+    reason: str,
+    actor: str,
+    only_this: bool = False,
+) -> Deleted:
+    """Delete a photograph and then its files.
+
+    See `service.store.deletion.delete_photograph`. During a back-up the
+    files stay until the job `prunings` removes them.
+    """
+    deleted = runtime.database.run_in_transaction(
+        lambda session: deletion.delete_photograph(
+            session, heliostat, identifier, reason, actor, only_this
+        )
+    )
+    with runtime.images.removing() as is_free:
+        if is_free:
+            with runtime.database.writing() as session:
+                image_files.remove_marked(session, runtime.images)
+    return deleted

@@ -1,10 +1,12 @@
-"""A representation other than JSON: media types, suffix, and conversion of maps to bytes."""
+"""Representations of maps other than JSON: media types, suffix, and conversion to bytes."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from service.base.arrays import pack
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,3 +39,25 @@ class Representation:
     media_types: tuple[str, ...]
     suffix: str
     write: Callable[[Maps], bytes]
+
+
+NPZ = "application/x-npz"
+NPZ_VENDOR = "application/vnd.numpy.npz"
+
+
+def _write_arrays(maps: Maps) -> bytes:
+    return pack(maps.arrays) if maps.packed is None else maps.packed
+
+
+PNG = "image/png"
+
+
+def _write_picture(maps: Maps) -> bytes:
+    return maps.picture(maps.title)
+
+
+REPRESENTATIONS = (
+    Representation((NPZ, NPZ_VENDOR), "npz", _write_arrays),
+    Representation((PNG,), "png", _write_picture),
+)
+"""The arrays as a NumPy archive, and a picture with axes, a colour bar and a title."""
