@@ -19,6 +19,8 @@ from model.receivers import Cavity, Panels
 from model.surface import DEGREE, basis
 from service.drawing.facets import FacetPlaces
 
+Array = NDArray[np.floating]
+
 
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file."""
@@ -27,7 +29,7 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _extend(values: NDArray[np.floating], low: float, high: float) -> str:
+def _extend(values: Array, low: float, high: float) -> str:
     """The ``extend`` of a matplotlib colour bar: the sides on which values lie beyond it."""
     is_below, is_above = bool(np.nanmin(values) < low), bool(np.nanmax(values) > high)
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get(
@@ -35,9 +37,7 @@ def _extend(values: NDArray[np.floating], low: float, high: float) -> str:
     )
 
 
-def flux_picture(
-    flux: NDArray[np.floating], size: tuple[float, float] | None, unit: str, title: str
-) -> bytes:
+def flux_picture(flux: Array, size: tuple[float, float] | None, unit: str, title: str) -> bytes:
     """A flux map (rows, columns) in colours, with axes in m or pixels.
 
     ``size`` is its width and height [m]; None gives pixels.
@@ -46,7 +46,7 @@ def flux_picture(
 
 
 def map_picture(
-    values: NDArray[np.floating],
+    values: Array,
     size: tuple[float, float] | None,
     title: str,
     colours: str,
@@ -69,7 +69,7 @@ def map_picture(
 
 def draw_map(
     axes: Axes,
-    values: NDArray[np.floating],
+    values: Array,
     size: tuple[float, float] | None,
     colours: str,
     bounds: tuple[float, float | None],
@@ -90,11 +90,7 @@ def draw_map(
 
 
 def places_picture(
-    places: NDArray[np.floating],
-    values: NDArray[np.floating],
-    title: str,
-    colours: str,
-    bounds: tuple[float, float],
+    places: Array, values: Array, title: str, colours: str, bounds: tuple[float, float]
 ) -> bytes:
     """Values at ``places`` (n, 2), east and north [m], as coloured dots.
 
@@ -106,12 +102,7 @@ def places_picture(
 
 
 def draw_places(
-    axes: Axes,
-    places: NDArray[np.floating],
-    values: NDArray[np.floating],
-    colours: str,
-    bounds: tuple[float, float],
-    label: str,
+    axes: Axes, places: Array, values: Array, colours: str, bounds: tuple[float, float], label: str
 ) -> None:
     """Draw the dots of `places_picture` into axes, with a colour bar if a value is known."""
     known, (east, north) = np.isfinite(values), places.T
@@ -142,7 +133,7 @@ def series_picture(
 
 
 def photograph_picture(
-    pixels: NDArray[np.generic], most: int, corners: NDArray[np.floating] | None = None
+    pixels: NDArray[np.generic], most: int, corners: Array | None = None
 ) -> bytes:
     """A photograph, gray or RGB, as JPEG of at most ``most`` pixels per side.
 
@@ -165,7 +156,7 @@ def photograph_picture(
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
-def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.float64]:
+def mirror_heights(z: Array, samples: int = 48) -> NDArray[np.float64]:
     """Heights (4, samples, samples) [mm] of control heights (4, 8, 8) [m], evenly spaced.
 
     Control heights are denser near the facet's edges, which would distort a picture.
@@ -176,9 +167,7 @@ def mirror_heights(z: NDArray[np.floating], samples: int = 48) -> NDArray[np.flo
     return across @ np.asarray(z, dtype=np.float64) @ along.T * 1e3
 
 
-def surface_picture(
-    z: NDArray[np.floating], title: str, bound: float, places: FacetPlaces
-) -> bytes:
+def surface_picture(z: Array, title: str, bound: float, places: FacetPlaces) -> bytes:
     """A surface of control heights (F, 8, 8) [m] as a map in mm, seen from the front.
 
     ``bound`` [mm] is the end of the scale on both sides; heights beyond it have the end colours.
@@ -187,9 +176,6 @@ def surface_picture(
     label = "deviation from the ideal facet [mm]"
     image = places.image(mirror_heights(z))
     return map_picture(image, (width, height), title, "RdBu_r", (-bound, bound), label, places)
-
-
-Array = NDArray[np.floating]
 
 
 def of_peak(measured: Array, forecast: Array) -> Array:

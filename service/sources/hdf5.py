@@ -165,6 +165,10 @@ class Hdf5Group:
         return self.members[name]
 
 
+# --- deflectometry
+# --------------------------------------------------------------------------------------------------
+
+
 # Most points per facet; SOFAST has one for each pixel of a camera.
 _MAX_POINTS = 500_000
 _MIN_POINTS = 256

@@ -290,6 +290,10 @@ def epoch_of(
     return Period(since, store.next_epoch(session, heliostat, since))
 
 
+# --- photographs that contradict the others
+# --------------------------------------------------------------------------------------------------
+
+
 # Fewer photographs cannot outvote a wrong one.
 _FEWEST = 6
 _DEVIATIONS = 3.0
