@@ -74,7 +74,7 @@ def test_migrate_makes_the_embedded_store(tmp_path: Path):
 _SLOW = """
 import os
 from service.base.settings import Settings
-from service.twin.runtime import runtime, slots
+from service.twin import runtime, slots
 from service.web.app import serve
 from tests.service.conftest import FakeOperations
 
