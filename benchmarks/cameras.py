@@ -18,7 +18,7 @@ from benchmarks.record import log_row, recording
 from heliotwin.folder_store import open_folder
 from service.base.settings import Settings
 from service.sources.folder import read_folder
-from service.twin.studies.camera_watch import FIGURES, CameraChange, find_camera_change
+from service.twin.studies.cameras import FIGURES, CameraChange, find_camera_change
 
 DRAWS, LONG, DAYS, LAST = 200, 60, 45, 7
 FACTORS = (1.5, 2.0, 3.0)

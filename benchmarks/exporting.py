@@ -23,10 +23,10 @@ from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
 from service.sources.photograph import IncomingPhotograph
+from service.store.backup import images_of
 from service.store.columns import now
 from service.store.database import Database
-from service.store.recovery.backup import images_of
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.surface_versions import NewSurface
 from service.store.tables import ImageRow
 from service.twin.photographs.ingest import measurement_row
 from tests.service.conftest import ORIGIN, properties_document, tower_document

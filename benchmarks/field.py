@@ -30,7 +30,7 @@ from service.store.columns import now
 from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow
 from service.twin.alarms import field_overview
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from tests.faults.harness import new_store

@@ -34,10 +34,10 @@ from service.base.settings import Settings
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker
-from service.store.jobs import queue
-from service.store.surfaces.surface_versions import NewSurface
-from service.twin.runtime.engines import Threads
-from service.twin.runtime.runtime import Runtime
+from service.store import queue
+from service.store.surface_versions import NewSurface
+from service.twin.engines import Threads
+from service.twin.runtime import Runtime
 from tests.field_rays import Land, onto_cylinder, onto_plane, trace_field
 
 AREA = 33.0

@@ -34,21 +34,19 @@ from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.documents import read_targets
 from service.sources.photograph import IncomingPhotograph
-from service.store import audit, record_retention, sizes
+from service.store import audit, deletion, image_files, queue, sizes
+from service.store.backup import images_of
 from service.store.columns import Base, now
 from service.store.database import Database
+from service.store.image_files import digest
 from service.store.job_tables import JobStepRow
-from service.store.jobs import queue
-from service.store.photographs import image_retention
-from service.store.photographs.image_files import digest
-from service.store.recovery.backup import images_of
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
+from service.twin import operations
 from service.twin.alarms.field_overview import read_summaries
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import light_watts
 from service.twin.photographs.ingest import measurement_row
-from service.twin.runtime import operations
 from tests.faults.harness import new_store
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 
@@ -355,8 +353,8 @@ def questions(filler: Filler) -> dict[str, Callable[[Session], Any]]:
             store.list_forecasts(s, 100),
         ),
         "sizes, as /jobs and /metrics report them": lambda s: sizes.sizes(s),
-        "is a pruning due, for age or quota": lambda s: image_retention.has_candidates(
-            s, image_retention.retention_rules(s, settings)
+        "is a pruning due, for age or quota": lambda s: image_files.has_candidates(
+            s, image_files.retention_rules(s, settings)
         ),
     }
 
@@ -368,24 +366,24 @@ def pruning(filler: Filler) -> dict[str, float]:
     with database.reading() as session:
         rules = {
             f"{rule.name}, {rule.reason}": rule
-            for rule in image_retention.retention_rules(session, tight)
+            for rule in image_files.retention_rules(session, tight)
         }
     for name, rule in rules.items():
         with database.reading() as session:
             started = time.perf_counter()
-            image_retention.mark_for_deletion(session, tight, rule, "benchmark")
+            image_files.mark_for_deletion(session, tight, rule, "benchmark")
             taken[f"delete 500 images ({name})"] = time.perf_counter() - started
     with database.writing() as session:
-        image_retention.mark_for_deletion(session, tight, rules["refused, age"], "benchmark")
+        image_files.mark_for_deletion(session, tight, rules["refused, age"], "benchmark")
     started = time.perf_counter()
     with filler.images.removing() as is_free, database.writing() as session:
         assert is_free
-        image_retention.remove_marked(session, filler.images)
+        image_files.remove_marked(session, filler.images)
     taken["remove their files"] = time.perf_counter() - started
     for name, prune in (
-        ("500 old forecasts", record_retention.prune_forecasts),
+        ("500 old forecasts", deletion.prune_forecasts),
         ("500 old jobs", queue.purge),
-        ("500 old audit entries", record_retention.prune_audit),
+        ("500 old audit entries", deletion.prune_audit),
     ):
         with database.reading() as session:
             started = time.perf_counter()

@@ -27,7 +27,7 @@ from model.imaging.light import LINEAR, Srgb
 from model.plant import Plant, TargetPlane
 from service.sources.decode import decode_image
 from service.sources.documents import read_json, read_targets, read_tower_base
-from service.sources.juelich import mark_layouts
+from service.sources.photograph import mark_layouts
 
 TOWER = "WRI1030197-tower-measurements.json"
 Image = NDArray[np.generic]

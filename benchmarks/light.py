@@ -63,9 +63,9 @@ from service.base.choices import Method
 from service.sources.decode import decode_image
 from service.sources.documents import Measurement
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
-from service.twin.heliostats.measurements import choose_diverse
-from service.twin.heliostats.outliers import reject_outliers
-from service.twin.runtime import operations
+from service.twin import operations
+from service.twin.measurements import choose_diverse
+from service.twin.surfaces.present_shape import reject_outliers
 
 Array = NDArray[np.float64]
 

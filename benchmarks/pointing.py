@@ -46,7 +46,7 @@ CLOCK_TRIALS = 12
 
 # Windows of measurements that calibrate, places of the windows, and measurements that follow each.
 FORWARD_KEPT, FORWARD_PLACES, FORWARD_JUDGES = (6, 12, 24, 48), 8, 4
-# A heliostat has moved if it is off by more standard deviations (`service.twin.pointing.errors`).
+# A heliostat has moved if it is off by more standard deviations (`service.twin.pointing_errors`).
 MOVED_STD = 5.0
 
 # How often the mounts are calibrated again as the last third comes in.

@@ -25,8 +25,8 @@ from model.metrics import surface_error
 from model.observation import SurfacePrediction, render_observations
 from model.plant_model import JUELICH_MODEL
 from service.sources.folder import read_folder
-from service.twin.heliostats.measurements import choose_diverse
-from service.twin.runtime.operations import predict
+from service.twin.measurements import choose_diverse
+from service.twin.operations import predict
 from training.cases import Case, make_cases
 from training.render import CleanCamera, load_field
 from training.surfaces import load_part, tilt_modes

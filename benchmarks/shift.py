@@ -41,9 +41,9 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.folder import read_folder
 from service.twin.alarms.field_updates import FieldStateWriter
+from service.twin.importing import import_folder
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 
 DAYS, ARCHIVED, UNSEEN = 70, 42, 14  # [d] before the end: begin, import, and what is never given

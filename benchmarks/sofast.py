@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.record import log_row, recording
 from model.surface import control_points, heights
-from service.sources.deflectometry import SOFAST_SHAPE
 from service.sources.folder import read_surface
+from service.sources.hdf5 import SOFAST_SHAPE
 from tests.service.sources import plant_files
 from tests.service.sources.test_sofast import FACETS, slope_rms_mrad, write_folder
 

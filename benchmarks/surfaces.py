@@ -57,8 +57,8 @@ from model.surface import heights
 from model.tracing import Window
 from model.tracing.montecarlo import trace_montecarlo
 from service.sources.folder import MeasurementFolder, measured_heights, read_folder
-from service.twin.heliostats.outliers import reject_outliers
-from service.twin.runtime import operations
+from service.twin import operations
+from service.twin.surfaces.present_shape import reject_outliers
 
 Array = NDArray[np.float64]
 

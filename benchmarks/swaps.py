@@ -30,9 +30,9 @@ from model.metrics import flux_accuracies
 from model.plant import Heliostat
 from service.sources.decode import decode_image
 from service.sources.folder import measured_heights, read_folder
-from service.twin.heliostats.measurements import AcceptedMeasurement, choose_diverse
+from service.twin import operations
+from service.twin.measurements import AcceptedMeasurement, choose_diverse
 from service.twin.photographs import likeness
-from service.twin.runtime import operations
 from training.render import TOWER_TOP
 from training.surfaces import load_surfaces
 

@@ -26,7 +26,7 @@ from service.base import settings as settings_module
 from service.base.settings import Settings
 from service.sources.plant_schema import json_schema
 from service.twin.alarms.field_overview import FieldOverviewCache
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from service.web.auth.security import Role
 from service.web.store_metrics import registry

@@ -31,7 +31,7 @@ from service.base.settings import Settings
 from service.drawing.pictures import mirror_heights, of_peak
 from service.sources.folder import MeasuredSurface, read_folder
 from service.store.tables import HeliostatRow, SurfaceRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 PICTURE = Path(__file__).parent / "images" / "overview.png"
 PHOTOGRAPH = PICTURE.with_name("photograph.jpg")

@@ -29,7 +29,7 @@ from service.twin.forecasts.mirror_states import (
     with_measured,
 )
 from service.twin.forecasts.watts import FieldWatts, field_watts, heliostat_watts
-from service.twin.plant.model_versions import DECLARED, ModelVersion
+from service.twin.model_versions import DECLARED, ModelVersion
 
 Array = NDArray[np.float64]
 

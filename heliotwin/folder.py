@@ -37,7 +37,7 @@ from service.sources.folder import (
     read_surface,
 )
 from service.store.tables import NO_IMAGE, MeasurementRow
-from service.twin.heliostats.measurements import accepted_measurement, to_observations
+from service.twin.measurements import accepted_measurement, to_observations
 from service.twin.surfaces.prediction import choose_observations
 
 Array = NDArray[np.float64]

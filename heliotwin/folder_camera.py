@@ -24,7 +24,7 @@ from service.sources.decode import Pixels, decode_image
 from service.sources.documents import Measurement
 from service.sources.files import read_file
 from service.sources.folder import MeasuredSurface, MeasurementFolder, points_of
-from service.twin.runtime import operations
+from service.twin import operations
 
 Array = NDArray[np.float64]
 

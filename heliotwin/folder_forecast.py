@@ -28,17 +28,17 @@ from model.setup import Setup
 from service import store
 from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasuredSurface, MeasurementFolder, points_of
-from service.sources.juelich import CENTERED_WINDOW
+from service.sources.photograph import CENTERED_WINDOW
 from service.store.tables import NO_IMAGE, MeasurementRow
-from service.twin.heliostats.measurements import (
+from service.twin import operations
+from service.twin.calibration import motors_of
+from service.twin.measurements import (
     AcceptedMeasurement,
     HeliostatContext,
     accepted_measurement,
     spot_position,
 )
-from service.twin.heliostats.stored_mount import load_mount
-from service.twin.pointing.calibration import motors_of
-from service.twin.runtime import operations
+from service.twin.stored_mount import load_mount
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from service.base.errors import SKIPPED, list_reasons
 from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasurementFolder
 from service.store.tables import MeasurementRow
-from service.twin.heliostats.stored_mount import StoredMount, load_mount
-from service.twin.pointing.calibration import calibrate_store, motors_of
+from service.twin.calibration import calibrate_store, motors_of
+from service.twin.stored_mount import StoredMount, load_mount
 
 
 def calibrate_folder(

@@ -28,21 +28,21 @@ from service.base.settings import Settings
 from service.sources.documents import IMAGE_KINDS, get, read_json
 from service.sources.files import read_file
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, points_of
+from service.store import mounts
 from service.store.columns import Base
+from service.store.image_files import digest, media_type
 from service.store.keys import RESERVED
-from service.store.photographs.image_files import digest, media_type
-from service.store.pointing import mounts
 from service.store.tables import NO_IMAGE, HeliostatRow, ImageRow, MeasurementRow, PlantRow
+from service.twin import model_versions, plant_setup
 from service.twin.forecasts.heliostat_forecast import aimed_setup, trace_flux
-from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
-from service.twin.photographs.camera_choice import KINDS, StoredMirror, find_camera
+from service.twin.measurements import HeliostatContext, load_heliostat_context
+from service.twin.model_versions import ModelVersion
+from service.twin.operations import Forecast
 from service.twin.photographs.ingest import measure_photograph, measurement_row, position_row
-from service.twin.plant import model_versions, setup
-from service.twin.plant.model_versions import ModelVersion
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.photographs.metadata import find_sun_contradictions
+from service.twin.runtime import Runtime
+from service.twin.studies.cameras import KINDS, StoredMirror, find_camera
 from service.twin.studies.study import StudyInputs, add_photographs
-from service.twin.warnings import find_sun_contradictions
 
 Array = NDArray[np.float64]
 
@@ -266,12 +266,12 @@ def _store_plant(
     plant, declared = folder.plant, folder.declared()
     every = [effect_to_json(effect) for effect in (*folder.model.effects, *effects)]
     declared = declared | ({"effects": every} if every else {})
-    by = setup.Authorship(RESERVED)
+    by = plant_setup.Authorship(RESERVED)
     with runtime.database.writing() as session:
-        setup.set_plant(session, by, plant, declared, facts=folder.facts)
+        plant_setup.set_plant(session, by, plant, declared, facts=folder.facts)
         for name in plant.heliostats:
             try:
-                row, _ = setup.set_heliostat(session, by, name, folder.properties[name])
+                row, _ = plant_setup.set_heliostat(session, by, name, folder.properties[name])
             except SKIPPED as error:
                 folder.skipped[name] = str(error)
                 continue

@@ -18,10 +18,10 @@ from model.plant import Receiver, TargetPlane
 from model.times import format_time
 from service.base.fields import Plane, Sun
 from service.base.progress import Progress, no_progress
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.sources.documents import read_json
 from service.sources.folder import MeasurementFolder
-from service.twin.runtime import operations
+from service.twin import operations
 
 
 def asked(

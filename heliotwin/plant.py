@@ -37,7 +37,7 @@ from service.drawing.pictures import draw_places
 from service.sources.documents import IMAGE_KINDS
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, read_folder
 from service.store.tables import MeasurementRow
-from service.twin.heliostats.measurements import accepted_measurement, to_observations
+from service.twin.measurements import accepted_measurement, to_observations
 from service.twin.surfaces.prediction import choose_observations
 
 

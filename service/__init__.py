@@ -1,11 +1,11 @@
-"""The service: eight packages. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""
+"""The service: seven packages. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""
 
 import os
 
-from service.base import threads
+from service.base import processes
 
 # OpenCV reads this when it is loaded. It is a second limit after the checks of
 # `service.sources.decode`: OpenCV decodes no image of more pixels.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
 
-threads.limit_threads()
+processes.limit_threads()

@@ -230,7 +230,7 @@ def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> 
 
 
 LIMITS = {
-    "lines of code": 54_533,
+    "lines of code": 54_423,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
@@ -238,6 +238,7 @@ LIMITS = {
     f"classes above {MAX_CLASS_LINES} lines": 1,
     "lines with latitude_deg": 17,
     "names of a forecast request's fields": 23,
+    "files in service": 198,
     "dict[str, Any] in service": 39,
     "page routes that use the store": 0,
 }
@@ -255,6 +256,7 @@ def count_all() -> dict[str, int]:
         len(long_classes()),
         lines_with("latitude_deg"),
         len(request_names()),
+        len(python_files(("service",))),
         sum(path.read_text().count("dict[str, Any]") for path in python_files(("service",))),
         len(page_routes_with_store()),
     )

@@ -18,7 +18,7 @@ from service.jobs.kind import Kinds
 from service.store import acknowledgements, field_state
 from service.store.database import Database
 from service.twin.alarms.field_updates import FieldStateWriter
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web import app as web_app
 
 

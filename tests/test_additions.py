@@ -26,7 +26,7 @@ FILES = {
     "page": "service/web/pages/hello.py",
     "CLI verb": "heliotwin/cli/verbs/greet.py",
     "importer": "service/sources/importers/notes.py",
-    "export format": "service/web/responses/representations/table.py",
+    "export format": "service/web/responses/table.py",
     "effect": "model/effects/dust_glow.py",
     "sun shape": "model/sunshape/cosine.py",
     "receiver": "model/wedge.py",

@@ -42,21 +42,26 @@ from service.base.fields import Sun
 from service.base.progress import no_progress
 from service.base.settings import Settings
 from service.drawing.facets import FacetPlaces
-from service.drawing.pictures import comparison_picture, flux_picture, of_peak, surface_picture
-from service.drawing.plant_picture import plant_picture
+from service.drawing.pictures import (
+    comparison_picture,
+    flux_picture,
+    of_peak,
+    plant_picture,
+    surface_picture,
+)
 from service.drawing.templates import ASSETS, TEMPLATES
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, read_folder
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import PLANT
 from service.store import add_study as store_study
+from service.twin import operations
 from service.twin.forecasts.heliostat_forecast import make_forecast
 from service.twin.forecasts.requests import ForecastIn
-from service.twin.heliostats.measurements import choose_diverse
-from service.twin.runtime import operations
-from service.twin.runtime.runtime import Runtime
+from service.twin.importing import import_folder
+from service.twin.measurements import choose_diverse
+from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
-from service.twin.transfer.importing import import_folder
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from model.errors import InvalidInputError, ModelError
 from service.base.discovery import modules_of
 from service.base.errors import ServiceError
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 
 
 class _Group(TyperGroup):

@@ -7,10 +7,10 @@ from heliotwin.cli.output import make_table
 from model.locating import BracketMarks, CameraCorners, CameraHomography, CameraPose, SheetEdges
 from model.plant import Cylinder, TargetPlane
 from model.receivers import Cavity, Panels
-from service.base.names import counted
+from service.base.validation import counted
 from service.sources.documents import describe_sun
 from service.sources.plant_file import PlantDescription
-from service.sources.plant_receivers import AnyReceiver
+from service.sources.plant_parts import AnyReceiver
 
 Report = dict[str, object]
 

@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
-    from service.twin.runtime.runtime import Runtime
+    from service.twin.runtime import Runtime
 
 
 def keep_private() -> None:
@@ -89,7 +89,7 @@ def open_runtime(is_new: bool = False) -> Iterator["Runtime"]:
     """
     from service.base.settings import Settings
     from service.store.database import require_store
-    from service.twin.runtime.runtime import Runtime
+    from service.twin.runtime import Runtime
 
     settings = Settings()
     if not is_new:

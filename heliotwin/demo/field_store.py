@@ -25,11 +25,11 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.sources.folder import MeasurementFolder, read_folder
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
+from service.twin.importing import import_folder
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin.runtime import Runtime
 
 ACTOR = "demo"
 """Who the store says made its jobs and sent its photographs."""

@@ -14,7 +14,7 @@ latter is 1 + 2 / n times larger for n measurements, because the field's prior a
 time are of all measurements. Forward in time it is `_DRIFT` times larger at least: days on both
 sides of a left-out day know its drift. `benchmarks.pointing --only forward` prints the share of
 later spots that it holds. A heliostat that moves after its calibration is in no such interval. Its
-move is reported (`service.twin.pointing.errors`).
+move is reported (`service.twin.pointing_errors`).
 """
 
 from collections.abc import Sequence

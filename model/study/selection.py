@@ -9,7 +9,8 @@ the mean is above a minimum.
 
 Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
 added. So is one that is much simpler than the best and gains most of what that gains: what it
-leaves may be another effect's. After each addition an effect that is no longer worthwhile is pruned.
+leaves may be another effect's. After each addition effects that are no longer worthwhile are
+pruned.
 """
 
 from dataclasses import dataclass, replace

@@ -30,8 +30,15 @@ from pydantic import (
 
 from model.plant import TargetPlane, require_plane_shape
 from service.base.choices import Method as Method  # also used by the command line
-from service.base.names import IDENTIFIER, LINE, LINES, MEASUREMENT, NAME
-from service.base.validation_messages import NO_TIME, not_a_number
+from service.base.validation import (
+    IDENTIFIER,
+    LINE,
+    LINES,
+    MEASUREMENT,
+    NAME,
+    NO_TIME,
+    not_a_number,
+)
 
 Name = Annotated[
     str,

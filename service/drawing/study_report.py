@@ -13,8 +13,7 @@ from model.study.advice import photographs_to_distinguish
 from model.study.outcome import Found
 from model.study.report import error_covariates, residual_map
 from service.drawing.charts import Array, HeatMap, difference_map
-from service.drawing.discrepancy_chart import amount_charts
-from service.drawing.study_charts import accuracy_chart, pictures, scatters
+from service.drawing.study_charts import accuracy_chart, amount_charts, pictures, scatters
 from service.drawing.templates import ASSETS, TEMPLATES
 
 VERDICTS = {"effect": "Effect found", "none": "Nothing missing", "unexplained": "Not explained"}

@@ -1,14 +1,13 @@
 """Creation and cancellation of jobs, for users or by the service itself."""
 
-from service.jobs.common import require_stored
-from service.jobs.kind import Kind, Kinds, Payload
+from service.jobs.kind import Kind, Kinds, Payload, require_stored
 from service.jobs.uploads import delete_unused_uploads
 from service.store import audit
 from service.store.job_tables import JobRow
-from service.store.jobs.queue import QueueBounds, add_job, cancel, delete_plan
 from service.store.keys import ITSELF
+from service.store.queue import QueueBounds, add_job, cancel, delete_plan
 from service.store.rows import Added
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 def enqueue(

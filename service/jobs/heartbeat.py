@@ -8,9 +8,9 @@ from contextlib import AbstractContextManager
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.base.background import in_background
+from service.base.processes import in_background
 from service.jobs.kind import Context
-from service.store.jobs import queue
+from service.store import queue
 
 logger = logging.getLogger("heliotwin.jobs")
 

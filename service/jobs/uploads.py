@@ -20,17 +20,16 @@ from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
 from service.base.errors import ConflictError, NotFoundError, StoreFullError, TooManyError
-from service.base.file_locks import file_lock
+from service.base.processes import file_lock
 from service.base.settings import Settings
-from service.sources.archive import unpack_archive
-from service.sources.files import confined_to
+from service.sources.files import confined_to, unpack_archive
 from service.sources.folder import read_folder
 from service.store import audit
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs.queue import ENDED
-from service.store.plant.geometry import require_origin
-from service.twin.runtime.runtime import Runtime
+from service.store.plant import require_origin
+from service.store.queue import ENDED
+from service.twin.runtime import Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
 

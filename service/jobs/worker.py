@@ -19,20 +19,25 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError, StatementError
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError, ModelError
-from service.base import logs, memory, telemetry
+from service.base import monitoring, processes
 from service.base.arrays import pack
 from service.base.errors import ServiceError
-from service.base.metrics import JOB_ATTEMPTS, JOB_SECONDS, PROCESS, measure_duration, serve_metrics
+from service.base.monitoring import (
+    JOB_ATTEMPTS,
+    JOB_SECONDS,
+    PROCESS,
+    measure_duration,
+    serve_metrics,
+)
 from service.base.settings import Settings
 from service.jobs.enqueuing import enqueue_due
 from service.jobs.heartbeat import heartbeat
 from service.jobs.kind import CancelRequestedError, Context, Kinds, WorkerStoppingError
 from service.jobs.uploads import delete_unused_uploads
-from service.store import record_retention
+from service.store import deletion, queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.twin.alarms.field_updates import FieldStateWriter
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 
 logger = logging.getLogger("heliotwin.jobs")
 
@@ -68,10 +73,10 @@ def _delete_old_records(runtime: Runtime) -> int:
     """Delete a batch of each kind of record that the settings do not keep; return their number."""
     settings, deleted = runtime.settings, 0
     for records, days, prune in (
-        ("jobs", settings.job_retention_days, record_retention.prune_jobs),
-        ("plans", settings.plan_retention_days, record_retention.prune_plans),
-        ("forecasts", settings.forecast_retention_days, record_retention.prune_forecasts),
-        ("audit entries", settings.audit_retention_days, record_retention.prune_audit),
+        ("jobs", settings.job_retention_days, deletion.prune_jobs),
+        ("plans", settings.plan_retention_days, deletion.prune_plans),
+        ("forecasts", settings.forecast_retention_days, deletion.prune_forecasts),
+        ("audit entries", settings.audit_retention_days, deletion.prune_audit),
     ):
         if days:
             with runtime.database.writing() as session:
@@ -166,7 +171,7 @@ class Worker:
             return False
         context = Context(self.runtime, queue.lease_of(job), job.created_by, self.stopping)
         with (
-            logs.log_context(job=job.id, kind=job.kind),
+            monitoring.log_context(job=job.id, kind=job.kind),
             measure_duration(JOB_SECONDS.labels(job.kind), f"job {job.kind}"),
         ):
             logger.info("%s: job %d (%s), attempt %d", self.name, job.id, job.kind, job.attempts)
@@ -360,9 +365,9 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         raise InvalidInputError(
             "job_workers: 0 works at nothing; give --count or HELIOTWIN_JOB_WORKERS"
         )
-    memory.limit_memory()
-    logs.configure_logging(settings)
-    telemetry.configure_tracing(settings, "heliotwin-worker")
+    processes.limit_memory()
+    monitoring.configure_logging(settings)
+    monitoring.configure_tracing(settings, "heliotwin-worker")
     stopping, stuck = threading.Event(), threading.Event()
 
     def on_stuck() -> None:
@@ -375,7 +380,7 @@ def work(settings: Settings, kinds: Kinds, operations: Operations | None = None)
         workers = Workers(runtime, kinds, settings.job_workers, on_stuck)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        with serve_metrics(settings, PROCESS), memory.returning_memory():
+        with serve_metrics(settings, PROCESS), processes.returning_memory():
             workers.start()
             stopping.wait()
             workers.stop()

@@ -23,10 +23,8 @@ from model.sunshape import SHAPES, Buie, SunShape
 from model.sunshape.buie import chi_of_csr, csr_of_chi
 from model.tracing import Optics
 from service.base.fields import JsonObject, Sun, unique_keys
-from service.base.names import require_text
-from service.base.plant_facts import PlantFacts
-from service.base.receivers import AnyReceiver
-from service.base.validation_messages import not_json, place_of
+from service.base.plant import AnyReceiver, PlantFacts
+from service.base.validation import not_json, place_of, require_text
 from service.sources.files import MAX_JSON_BYTES, MAX_JSON_VALUES, read_file
 from service.sources.heliostat_document import heliostat_from_json, is_heliostat_document
 from service.sources.paint_documents import azimuth_from_north

@@ -17,10 +17,10 @@ from model.plant_model import PlantModel
 from model.surface import DEGREE, control_points, greville, heights
 from service.base.arrays import unpack_untrusted
 from service.base.discovery import modules_of
-from service.base.plant_facts import NO_FACTS, PlantFacts
-from service.sources.deflectometry import read_deflectometry
+from service.base.plant import NO_FACTS, PlantFacts
 from service.sources.documents import Array, Declared, Measurement, get, parse_declared, read_json
 from service.sources.files import read_file
+from service.sources.hdf5 import read_deflectometry
 
 # PAINT's splines have 240 kB.
 _MAX_SPLINE_BYTES = 2**22

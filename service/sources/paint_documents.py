@@ -9,8 +9,7 @@ import numpy as np
 from model.locating import locator_to_json
 from model.plant import Cylinder, Plant, TargetPlane
 from model.times import format_time
-from service.base.plant_facts import NO_FACTS, PlantFacts
-from service.base.receivers import receiver_to_json
+from service.base.plant import NO_FACTS, PlantFacts, receiver_to_json
 from service.sources.photograph import IncomingPhotograph
 
 STAC_VERSION = "1.1.0"

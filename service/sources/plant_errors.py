@@ -11,7 +11,7 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from model.errors import InvalidInputError, ModelError
-from service.base.validation_messages import message_of
+from service.base.validation import message_of
 from service.sources.plant_schema import (
     Drive,
     KeyMistakeError,
@@ -20,7 +20,7 @@ from service.sources.plant_schema import (
     SunEntry,
     nearest,
 )
-from service.sources.yaml_text import KeyPath, YamlDocument, read_yaml
+from service.sources.text_lines import KeyPath, YamlDocument, read_yaml
 
 # Forms of a value besides its words, for the message of a word that is none of them.
 _OTHER_FORMS = {

@@ -12,10 +12,10 @@ from model.plant import Plant, TargetPlane
 from model.sunshape import Buie
 from model.tracing import Optics
 from service.base.fields import JsonObject
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import sun_to_json
 from service.sources.plant_formats.imported import LAYOUT, PLANT, plant_text, site
-from service.sources.plant_receivers import receiver_entry
+from service.sources.plant_parts import receiver_entry
 
 _LAYOUT = ("name", "type", "east_m", "north_m", "up_m", "receiver", "focal_length_m")
 

@@ -18,7 +18,7 @@ from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.sunshape.buie import chi_of_csr
 from model.tracing import Optics
 from service.sources.plant_errors import Mistakes, PlantText, mistakes_at, named_file, parse_plant
-from service.sources.plant_receivers import AnyReceiver, read_receivers, read_targets
+from service.sources.plant_parts import AnyReceiver, read_receivers, read_targets, read_type
 from service.sources.plant_schema import (
     BuieSun,
     FacetFileEntry,
@@ -29,8 +29,7 @@ from service.sources.plant_schema import (
     nearest,
 )
 from service.sources.plant_tables import PlacedHeliostat, read_layout
-from service.sources.plant_types import read_type
-from service.sources.yaml_text import YamlDocument, read_yaml
+from service.sources.text_lines import YamlDocument, read_yaml
 
 Array = NDArray[np.float64]
 

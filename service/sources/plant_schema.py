@@ -23,9 +23,8 @@ from pydantic import (
 from model.actuator import LinearActuator
 from model.plant import require_cylinder_shape
 from service.base.fields import Extent, Flag, Metres, Model, Name, Number, Plane, Position, Whole
-from service.base.names import LINE, NAME
-from service.base.plant_facts import TowerSize
-from service.base.receivers import NAMES_WITH_UNITS, PlaneReceiverIn
+from service.base.plant import NAMES_WITH_UNITS, PlaneReceiverIn, TowerSize
+from service.base.validation import LINE, NAME
 
 MAX_HELIOSTATS = 50_000
 """Most heliostats of a plant."""
@@ -367,7 +366,7 @@ class LayoutEntry(PlantPart):
 
 
 class SurfacePart(PlantPart):
-    """Base of receivers and targets: fields as of `service.base.receivers`, keys with units."""
+    """Base of receivers and targets: fields as of `service.base.plant`, keys with units."""
 
     model_config = ConfigDict(alias_generator=lambda name: NAMES_WITH_UNITS.get(name, name))
 

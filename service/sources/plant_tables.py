@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from model.errors import InvalidInputError
 from model.heliostat_type import FacetDesign, circle_outline
 from model.plant import Outline, outline_share
-from service.base.names import NAME, require_name
+from service.base.validation import NAME, require_name
 from service.sources.files import file_name, read_text
 from service.sources.plant_errors import Mistakes
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry, nearest

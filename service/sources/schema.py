@@ -22,10 +22,8 @@ from pydantic import (
 from model.errors import InvalidInputError
 from model.pointing import Weather
 from service.base.fields import Direction, Elevation, Extent, Name, Number, Wgs84, parse_moment
-from service.base.names import FORMS, LINES, is_text
-from service.base.plant_facts import TowerSize
-from service.base.receivers import ReceiverIn
-from service.base.validation_messages import format_validation_error
+from service.base.plant import ReceiverIn, TowerSize
+from service.base.validation import FORMS, LINES, format_validation_error, is_text
 from service.sources.plant_schema import LocatorDocument, Spindle
 
 WindSpeed = Annotated[Number, Field(ge=0, le=100)]

@@ -3,7 +3,8 @@
 `from service import store` gives the queries: functions on a SQLAlchemy session.
 """
 
-from service.store.photographs.measurements import (
+from service.store.deletion import remove_heliostat, remove_receiver, remove_target
+from service.store.measurements import (
     add_alias,
     add_measurement,
     add_position,
@@ -18,7 +19,7 @@ from service.store.photographs.measurements import (
     recent_measurements,
     use_image,
 )
-from service.store.plant.geometry import (
+from service.store.plant import (
     count_photographs,
     find_heliostat,
     find_plant,
@@ -47,7 +48,6 @@ from service.store.plant.geometry import (
     stored_tower,
     target_plane,
 )
-from service.store.plant.removal import remove_heliostat, remove_receiver, remove_target
 from service.store.results import (
     Studied,
     add_forecast,
@@ -66,7 +66,7 @@ from service.store.results import (
     times_of_photographs,
 )
 from service.store.rows import Change, insert
-from service.store.surfaces.surface_versions import (
+from service.store.surface_versions import (
     NewSurface,
     Outdated,
     Trust,

@@ -14,7 +14,7 @@ ROLES: tuple[str, ...] = get_args(RoleName)
 
 
 class JobRow(Base):
-    """A background job; see `service.store.jobs.queue` for its states.
+    """A background job; see `service.store.queue` for its states.
 
     - ``lease_token`` identifies the one worker that may write to the job until ``lease_until``.
     - ``revision`` counts visible changes.
@@ -167,7 +167,7 @@ class AlarmRow(Base):
 class AuditRow(Base):
     """An entry of the audit trail: who did what, and when.
 
-    Rows never change. Old ones are deleted (`service.store.record_retention`).
+    Rows never change. Old ones are deleted (`service.store.deletion`).
     """
 
     __tablename__ = "audit"

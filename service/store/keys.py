@@ -16,7 +16,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
-from service.base import names
+from service.base import validation
 from service.base.errors import ConflictError, NotFoundError
 from service.store import audit, sessions
 from service.store.columns import now
@@ -55,7 +55,7 @@ def create(
     ConflictError
         If a key has or had this name, even if it is withdrawn.
     """
-    names.require_name(names.NAME, name, "key")
+    validation.require_name(validation.NAME, name, "key")
     if name == RESERVED:
         raise InvalidInputError(
             f"key {name!r}: this name is reserved for access without a key; choose another"

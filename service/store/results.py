@@ -11,9 +11,9 @@ from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 from service.base.errors import NotFoundError
 from service.store.columns import Base
 from service.store.job_tables import JobRow
-from service.store.jobs.queue import KEPT
 from service.store.listing import NEWEST_FIRST, Order, Period, select_after
-from service.store.plant.geometry import get_target
+from service.store.plant import get_target
+from service.store.queue import KEPT
 from service.store.rows import lock_row
 from service.store.tables import (
     ForecastRow,

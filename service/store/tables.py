@@ -1,7 +1,7 @@
 """The database tables, one typed class each. Column names include units.
 
 Arrays are compressed npz blobs that load on demand. Images are files
-(`service.store.photographs.image_files`), referred to by their SHA-256.
+(`service.store.image_files`), referred to by their SHA-256.
 """
 
 from datetime import datetime
@@ -117,7 +117,7 @@ class TargetRow(Base):
 
 
 class ReceiverRow(Base):
-    """A receiver in ENU [m], of a ``kind`` of `service.base.receivers`.
+    """A receiver in ENU [m], of a ``kind`` of `service.base.plant`.
 
     ``geometry`` has the other fields of its document.
     """
@@ -135,7 +135,7 @@ class ImageRow(Base):
     """A stored image file by its hash; ``accepted`` if any of its measurements was.
 
     - ``pruned_at`` is when the file was marked for deletion
-      (`service.store.photographs.image_retention`), and ``pruned_for`` is why.
+      (`service.store.image_files`), and ``pruned_for`` is why.
     - ``removed_at`` is when the file was deleted.
     - ``created_at`` is when it arrived, or arrived again after it was marked.
     """
@@ -286,8 +286,8 @@ class SurfaceRow(Base):
       leave it empty.
     - ``valid_from`` is None if its start is unknown: measured surfaces, photographs without a time.
     - ``epoch_since`` is when the epoch of the mirror began that it describes, None if it never
-      changed: photographs from before show another shape (`service.twin.surfaces.epochs`).
-    - ``is_candidate``: a candidate is never active (`service.store.surfaces.decisions`).
+      changed: photographs from before show another shape (`service.twin.surfaces.present_shape`).
+    - ``is_candidate``: a candidate is never active (`service.store.decisions`).
     - ``model`` names the network weights, ``model_version`` the plant's model with its effects.
     - ``trusted``, ``warnings`` (sentences), ``warned_since``, ``acknowledged_at`` and
       ``acknowledged_by`` assess a prediction (`model.observation.SurfacePrediction`). Measured
@@ -418,8 +418,9 @@ class HeliostatStateRow(Base):
     - ``surface_id`` is the surface of ``deviation_mm`` and ``uncertainty_mm``.
     - ``accuracy`` is the mean over ``held_out`` photographs [1]; None if there are none.
     - ``accuracies`` [1] are those of the active surface on the newest photographs, by their row
-      ids, under ``series_key``. ``fall`` is a `service.twin.surfaces.epochs.AccuracyFall` of them.
-    - ``pointing`` is a `service.twin.pointing.errors.PointingState`.
+      ids, under ``series_key``.
+    - ``fall`` is their `service.twin.surfaces.present_shape.AccuracyFall`.
+    - ``pointing`` is a `service.twin.pointing_errors.PointingState`.
     """
 
     __tablename__ = "heliostat_state"
@@ -447,7 +448,7 @@ class FieldStateRow(Base):
     - ``revision`` counts writes of alarms, and ``states`` those of `HeliostatStateRow`.
     - ``marks`` are the newest rows behind the alarms (`service.twin.alarms.field_overview`).
     - ``pending`` heliostats had no valid results then.
-    - ``cameras`` are `service.twin.studies.camera_watch.CameraChange`.
+    - ``cameras`` are `service.twin.studies.cameras.CameraChange`.
     - ``pointing_limit_mrad`` is the limit of the settings behind the pointing of all heliostats.
     """
 

@@ -22,18 +22,17 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.base import logs
-from service.base.fair_queue import as_caller
-from service.base.metrics import REQUEST_SECONDS, REQUESTS
+from service.base import monitoring
+from service.base.monitoring import REQUEST_SECONDS, REQUESTS
 from service.base.settings import Settings
 from service.store.keys import record_use
-from service.twin.runtime.slots import STOPPING
+from service.twin.slots import STOPPING, as_caller
 from service.web.auth import security
-from service.web.auth.bodies import BodyLimiter, HeldBody, JsonShape
 from service.web.auth.dependencies import takes_archive, takes_upload
-from service.web.auth.rate_limiter import RateLimiter, sender_of
+from service.web.auth.limiters import RateLimiter, sender_of
+from service.web.auth.request_checks import BodyLimiter, HeldBody, JsonShape
 from service.web.responses import pages, problems
-from service.web.responses.fragments import take_part
+from service.web.responses.pages import take_part
 from service.web.responses.problems import SECURITY_HEADERS, problem
 
 logger = logging.getLogger("heliotwin.access")
@@ -85,7 +84,7 @@ class RequestIdMiddleware(_Middleware):
                 _note(scope, method, message["status"], time.perf_counter() - started)
             await send(message)
 
-        with logs.log_context(request_id=identity):
+        with monitoring.log_context(request_id=identity):
             await self.app(scope, receive, send_with_id)
 
 
@@ -386,8 +385,8 @@ class BodyLimitMiddleware:
     only a small form.
 
     Each part must arrive within a fixed time. The whole body has that time once, and additionally
-    the time of the received bytes at the minimum rate of the settings. `service.web.auth.bodies`
-    limits the bytes of a key that are not answered yet.
+    the time of the received bytes at the minimum rate of the settings. `BodyLimiter` limits the
+    bytes of a key that are not answered yet.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, limiter: BodyLimiter) -> None:

@@ -17,17 +17,16 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from service.base.metrics import PROCESS
+from service.base.monitoring import PROCESS
 from service.base.settings import Settings
-from service.store import field_state, sizes
+from service.store import field_state, queue, sizes
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow
 from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.reasons import REASONS
-from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CHANGES, CameraChange
+from service.twin.runtime import Runtime
+from service.twin.studies.cameras import CHANGES, CameraChange
 
 _VERDICTS = {True: "yes", False: "no", None: "unknown"}
 

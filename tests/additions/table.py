@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 
-from service.web.responses.representation import Maps, Representation
+from service.web.responses.representations import Maps, Representation
 
 
 def write(maps: Maps) -> bytes:
@@ -16,4 +16,4 @@ def write(maps: Maps) -> bytes:
     return buffer.getvalue().encode()
 
 
-REPRESENTATION = Representation(("text/csv",), "csv", write)
+REPRESENTATIONS = (Representation(("text/csv",), "csv", write),)

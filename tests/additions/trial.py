@@ -32,7 +32,7 @@ from model.tracing import Optics, Window
 from service.base.settings import Settings
 from service.sources.folder import read_declared, read_folder
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from service.web.app import create_app
 
 with warnings.catch_warnings():

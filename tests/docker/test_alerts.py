@@ -21,8 +21,8 @@ import yaml
 from sqlalchemy import update
 
 from service.base.settings import Settings
+from service.store import queue
 from service.store.columns import now
-from service.store.jobs import queue
 from service.store.tables import HeliostatRow
 from service.twin.alarms.field_updates import FieldStateWriter
 from service.web.app import create_app

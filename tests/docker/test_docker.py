@@ -28,7 +28,7 @@ from service.base.settings import Settings
 from service.store.database import alembic_config
 from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.alarms.reasons import REASONS
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.store_metrics import registry
 from tests.docker.files import DOCKER, ROOT, SECRET, drawn_expressions
 
@@ -484,7 +484,7 @@ from service.store.database import migrate
 from service.web.store_metrics import registry
 from service.twin.alarms.field_overview import FieldOverviewCache
 from service.twin.alarms.reasons import REASONS
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.base.settings import Settings
 print(migrate(Settings(data_dir=pathlib.Path(sys.argv[2]))))
 from model.network.predictor import default_predictor

@@ -21,9 +21,9 @@ import psycopg
 from sqlalchemy import make_url
 
 from service.base.settings import Settings
+from service.store.backup import images_of
+from service.store.check import StoreReport, inspect_store
 from service.store.database import Database
-from service.store.recovery.backup import images_of
-from service.store.recovery.check import StoreReport, inspect_store
 from tests.forked import ForkedProcess, forked_process
 from tests.service.conftest import (
     POSTGRES,

@@ -18,8 +18,8 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import work
 from service.store import columns
-from service.twin.runtime import runtime
-from service.web import server
+from service.twin import runtime
+from service.web import app
 from tests.service.conftest import FakeOperations
 
 
@@ -54,7 +54,7 @@ def run(what: str) -> None:
     if what == "worker":
         work(Settings(), KINDS)
     else:
-        server.serve(Settings())
+        app.serve(Settings())
 
 
 if __name__ == "__main__":

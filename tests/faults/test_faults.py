@@ -7,7 +7,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations
 from tests.service.exported import require_round_trip
 

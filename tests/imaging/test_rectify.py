@@ -8,7 +8,7 @@ from model.imaging import Camera
 from model.imaging.marks import find_marks
 from model.imaging.rectify import check_corners, find_corners, rectify
 from model.plant import TargetPlane
-from service.sources.juelich import mark_layouts
+from service.sources.photograph import mark_layouts
 
 ARM, STROKE = 0.74, 0.16  # [m]
 

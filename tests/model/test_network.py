@@ -30,7 +30,7 @@ from model.setup import Setup
 from model.surface import control_points, mirrored
 from model.tracing import Scene
 from model.tracing.convolution import central_rays
-from service.twin.runtime import operations
+from service.twin import operations
 from tests.conftest import flat_heliostat, target
 from training.export import PARITY_MM, example, export, parity, rounded
 from training.render import Renderings, SceneSampler, Setups

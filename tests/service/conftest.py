@@ -38,7 +38,7 @@ from service.base.settings import Settings
 from service.sources.paint_documents import azimuth_from_north
 from service.store.columns import Base
 from service.store.database import Database
-from service.twin.runtime.operations import Forecast
+from service.twin.operations import Forecast
 from service.web.app import create_app
 from tests.conftest import made_once
 from tests.waiting import WAIT_LIMIT_S, until
@@ -179,7 +179,7 @@ def database(store_url: URL) -> Iterator[Database]:
 
 @dataclass
 class FakeOperations:
-    """Answers like `service.twin.runtime.operations` at no cost, and remembers what it was asked.
+    """Answers like `service.twin.operations` at no cost, and remembers what it was asked.
 
     An image whose first pixel is 0 is refused; a forecast that aims below the ground is out of
     reach. Surfaces forecast every photograph exactly, the ideal mirror a little worse.

@@ -14,9 +14,9 @@ import service.store.job_tables  # noqa: F401 - its tables belong to the metadat
 from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store.columns import Base
-from service.twin.runtime.runtime import Operations, Runtime
-from service.twin.transfer.exporting import export_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.exporting import export_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Operations, Runtime
 
 ALL = frozenset({"*"})
 NOT_EXPORTED: dict[str, frozenset[str]] = {

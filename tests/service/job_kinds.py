@@ -16,7 +16,7 @@ from service.base.settings import Settings
 from service.jobs import heartbeat, worker
 from service.jobs.kind import Context, Kind, Kinds, Result
 from service.store.job_tables import AuditRow
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 
 
 class SquareIn(Model):
@@ -109,7 +109,7 @@ def _take_time(context: Context, payload: SquareIn, stays: bool) -> None:
 
 
 def _attempt(context: Context) -> int:
-    from service.store.jobs import queue
+    from service.store import queue
 
     with context.runtime.database.reading() as session:
         return queue.get_job(session, context.lease.job_id).attempts

@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of
 

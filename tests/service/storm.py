@@ -14,8 +14,8 @@ from model.ephemeris import sun_positions
 from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store.columns import now
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import QUIET, FakeOperations, client_of, png, poster
 

@@ -5,7 +5,7 @@ from typing import Any
 from service import store
 from service.store.database import Database
 from service.store.tables import PlantRow, StudyRow
-from service.twin.plant import model_versions
+from service.twin import model_versions
 from tests.service.conftest import ORIGIN
 
 GAMMA = {

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.drawing.discrepancy_chart import amount_charts
+from service.drawing.study_charts import amount_charts
 
 PER = {"covariate": "sun_elevation", "unit": "deg", "center": 30.0, "limits": [20.0, 50.0]}
 

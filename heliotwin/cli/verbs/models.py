@@ -56,8 +56,8 @@ def adopt(
     from service import store
     from service.base.settings import Settings
     from service.sources.documents import read_json
-    from service.twin.plant import model_versions
-    from service.twin.runtime.runtime import Runtime
+    from service.twin import model_versions
+    from service.twin.runtime import Runtime
     from service.twin.studies.field_change import require_no_contradiction
     from service.twin.studies.study import date_report, model_of_report, parse_report, row_of_report
 
@@ -100,7 +100,7 @@ def withdraw(
     as_json: AsJson = False,
 ) -> None:
     """Withdraw what was adopted from a study; the version before is current again."""
-    from service.twin.plant import model_versions
+    from service.twin import model_versions
 
     with writing() as session:
         model_versions.withdraw(session, study, actor())

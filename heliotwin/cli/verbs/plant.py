@@ -73,7 +73,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Draw a plant: the field from above, and tower, receivers and targets from the side."""
-    from service.drawing.plant_picture import plant_picture
+    from service.drawing.pictures import plant_picture
     from service.sources.plant_file import read_plant
 
     require_file(out)
@@ -106,7 +106,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Make a plant of another program's file; notes say what the file leaves open."""
-    from service.base.names import counted
+    from service.base.validation import counted
     from service.sources.plant_formats.formats import import_plant
 
     require_folder(out)

@@ -45,7 +45,7 @@ def calibrate(
     from heliotwin.folder_pointing import calibrate_folder
     from model.pointing.report import clock_in_words
     from service.sources.folder import read_folder
-    from service.twin.pointing.calibration import UndatedCount
+    from service.twin.calibration import UndatedCount
 
     require_file(out)
     source = read_folder(folder)

@@ -35,8 +35,8 @@ def backup(folder: New, as_json: AsJson = False) -> None:
     The backup is consistent. The exit code is 1 if an image is bad.
     """
     from service.base.settings import Settings
+    from service.store.backup import back_up
     from service.store.database import require_store
-    from service.store.recovery.backup import back_up
 
     settings = Settings()
     require_store(settings)
@@ -56,7 +56,7 @@ def backup(folder: New, as_json: AsJson = False) -> None:
 def restore(folder: Old, as_json: AsJson = False) -> None:
     """Restore a backup into an empty store, after all its hashes are verified."""
     from service.base.settings import Settings
-    from service.store.recovery.backup import restore as put_back
+    from service.store.backup import restore as put_back
 
     keep_private()
     settings = Settings()
@@ -74,9 +74,9 @@ def restore(folder: Old, as_json: AsJson = False) -> None:
 def check(as_json: AsJson = False) -> None:
     """Check the hash of every stored image, and SQLite's file; exit code 1 if anything is lost."""
     from service.base.settings import Settings
+    from service.store.backup import images_of
+    from service.store.check import inspect_store
     from service.store.database import Database, require_store
-    from service.store.recovery.backup import images_of
-    from service.store.recovery.check import inspect_store
 
     settings = Settings()
     require_store(settings)

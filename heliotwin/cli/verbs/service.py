@@ -27,7 +27,7 @@ app = typer.Typer()
 def import_(folder: Folder, as_json: AsJson = False) -> None:
     """Import a measurement folder into the store; a second run changes nothing."""
     from service.sources.folder import read_folder
-    from service.twin.transfer.importing import import_folder
+    from service.twin.importing import import_folder
 
     keep_private()
     source = read_folder(folder, whole_field=True)
@@ -46,7 +46,7 @@ def export(
 
     `heliotwin import` reads it.
     """
-    from service.twin.transfer.exporting import export_folder
+    from service.twin.exporting import export_folder
 
     with open_runtime() as runtime, progress(None, "export") as step:
         report = export_folder(runtime, folder, step)
@@ -76,7 +76,7 @@ def serve(
     another.
     """
     from service.base.settings import Settings
-    from service.web import server
+    from service.web.app import serve as serve_app
 
     keep_private()
     given = {"host": host, "port": port}
@@ -89,7 +89,7 @@ def serve(
         else:
             console.print(f"heliotwin listens on {address}, its documentation on {address}/docs")
 
-    server.serve(settings, say)
+    serve_app(settings, say)
 
 
 @app.command()

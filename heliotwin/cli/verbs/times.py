@@ -25,10 +25,9 @@ def times(
     as_json: AsJson = False,
 ) -> None:
     """Set the times of stored measurements, all or none; each is stored as a correction."""
-    from service.base.names import counted
+    from service.base.validation import counted
     from service.sources.files import require_regular
-    from service.twin.photographs.batches import TIMES, correct_many
-    from service.twin.photographs.times import read_times
+    from service.twin.photographs.batches import TIMES, correct_many, read_times
 
     with require_regular(file).open(encoding="utf-8-sig", newline="") as lines:
         given = read_times(lines, str(file), reason)

@@ -40,16 +40,24 @@ from service.base.fields import (
     SunAt,
     parse_moment,
 )
-from service.base.memory import return_memory
-from service.jobs.common import MAX_PIXELS, require_some
-from service.jobs.kind import Context, Kind, Result
+from service.base.processes import return_memory
+from service.jobs.kind import MAX_PIXELS, Context, Kind, Result, require_some
 from service.jobs.kinds.field_forecasts import FleetForecastIn, expected_s
 from service.sources.limits import Limit
-from service.store.jobs import queue
+from service.store import queue
 from service.store.tables import HeliostatRow
-from service.twin.forecasts.aim_drives import AimDrives, no_drive
-from service.twin.forecasts.aim_sources import SOURCES, plant_time_zone, sources_of
-from service.twin.forecasts.aims import ROWS, aim_figures, begin_at, excess_of, places_on
+from service.twin.forecasts.aims import (
+    ROWS,
+    SOURCES,
+    AimDrives,
+    aim_figures,
+    begin_at,
+    excess_of,
+    no_drive,
+    places_on,
+    plant_time_zone,
+    sources_of,
+)
 from service.twin.forecasts.field_forecast import (
     Fleet,
     HeliostatGroup,
@@ -60,7 +68,7 @@ from service.twin.forecasts.field_forecast import (
 )
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.requests import position_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MAX_STEPS = 100
 """Maximum number of steps of a day."""

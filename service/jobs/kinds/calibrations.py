@@ -6,9 +6,8 @@ from pydantic import Field
 
 from model.pointing.report import clock_to_json
 from service.base.fields import Model, Moment
-from service.jobs.common import Heliostats, chosen_names
-from service.jobs.kind import Context, Kind, Result
-from service.twin.pointing.calibration import calibrate_store, store_mounts
+from service.jobs.kind import Context, Heliostats, Kind, Result, chosen_names
+from service.twin.calibration import calibrate_store, store_mounts
 
 
 class CalibrationIn(Model):

@@ -7,8 +7,8 @@ from service.base.errors import ConflictError
 from service.base.fields import Model
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
-from service.twin.photographs.camera_choice import count_images, find_camera, read_mirrors
-from service.twin.plant import model_versions
+from service.twin import model_versions
+from service.twin.studies.cameras import count_images, find_camera, read_mirrors
 
 
 class CameraChoicesIn(Model):

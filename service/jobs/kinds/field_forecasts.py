@@ -14,9 +14,17 @@ from model.fleet import LOSSES, FleetFlux, Losses
 from model.plant import Receiver
 from service import store
 from service.base.fields import AnySun, Flag, ModelVersion, Name, Position, Resolution
-from service.jobs.common import Heliostats, chosen_names, count_chosen, require_some
-from service.jobs.kind import Context, Kind, Result
-from service.store.jobs import queue
+from service.jobs.kind import (
+    Context,
+    Heliostats,
+    Kind,
+    Result,
+    chosen_names,
+    count_chosen,
+    require_some,
+)
+from service.store import queue
+from service.twin import model_versions
 from service.twin.alarms.measured_states import read_mirror_states
 from service.twin.forecasts.field_forecast import (
     Checkpoint,
@@ -29,8 +37,7 @@ from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.mirror_states import with_measured
 from service.twin.forecasts.requests import ReceiverChoice, position_of
 from service.twin.forecasts.watts import Sunlight, field_watts, heliostat_watts
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class FleetIn(ReceiverChoice):

@@ -18,8 +18,8 @@ from service.sources.files import confined_to
 from service.sources.folder import MeasurementFolder, read_folder
 from service.store.job_tables import JobRow
 from service.store.rows import serialize_writers
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import Imported, import_folder
+from service.twin.importing import Imported, import_folder
+from service.twin.runtime import Runtime
 
 
 class ImportIn(Model):

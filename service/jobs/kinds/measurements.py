@@ -9,14 +9,13 @@ from service import store
 from service.base.choices import Method
 from service.base.errors import SKIPPED, ConflictError, GoneError
 from service.base.fields import Model, Reason
-from service.jobs.common import Heliostats, chosen_names, require_some
 from service.jobs.enqueuing import enqueue
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import Context, Heliostats, Kind, Result, chosen_names, require_some
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
+from service.twin import model_versions
 from service.twin.photographs.corrections import remeasure
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class MeasurementsIn(Model):

@@ -16,8 +16,7 @@ from model.receivers import Cavity, Panels
 from model.times import format_minute, format_time
 from service import store
 from service.base.fields import Metres, Moment, Name, Number, Resolution, Sun, Text, VersionIn
-from service.jobs.common import MAX_PIXELS, require_some
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import MAX_PIXELS, Context, Kind, Result, require_some
 from service.jobs.kinds.aim_plans import PlannedAims
 from service.jobs.kinds.field_forecasts import FleetIn, expected_s
 from service.twin.forecasts.field_forecast import (
@@ -28,7 +27,7 @@ from service.twin.forecasts.field_forecast import (
 )
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.watts import FieldWatts, field_watts
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 MAX_TIMES = 100
 """Maximum number of times of a plan."""

@@ -12,12 +12,11 @@ from service import store
 from service.base.choices import require_images
 from service.base.errors import SKIPPED
 from service.base.fields import Method, Model, ModelVersion, Moment, Whole
-from service.jobs.common import Heliostats, chosen_names, require_some
-from service.jobs.kind import Context, Kind, Result
+from service.jobs.kind import Context, Heliostats, Kind, Result, chosen_names, require_some
 from service.sources.documents import read_heliostat
 from service.sources.schema import STORED
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
+from service.twin import model_versions
+from service.twin.runtime import Runtime
 from service.twin.surfaces.evaluation import PARTS
 from service.twin.surfaces.prediction import (
     READING,

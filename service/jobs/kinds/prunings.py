@@ -7,9 +7,8 @@ from sqlalchemy.orm import Session
 from service.base.fields import Model
 from service.base.settings import Settings
 from service.jobs.kind import Context, Kind, Result
-from service.store.jobs import queue
-from service.store.photographs import image_retention
-from service.store.photographs.image_retention import RetentionRule
+from service.store import image_files, queue
+from service.store.image_files import RetentionRule
 
 
 class PruningsIn(Model):
@@ -20,14 +19,14 @@ def prune(context: Context, _payload: PruningsIn) -> Result:
     """Mark, then delete images. After a restart the job continues with the remaining ones."""
     settings, counts, size = context.runtime.settings, Counter[str](), 0
     with context.runtime.database.reading() as session:
-        found = image_retention.retention_rules(session, settings)
+        found = image_files.retention_rules(session, settings)
     for index, rule in enumerate(found):
         what = f"{rule.name}, {rule.reason}"
         context.report(index / len(found), what, phase="rules", n_done=index, n_total=len(found))
         size += _give_up(context, rule, counts)
     removed = _remove(context)
     with context.runtime.database.reading() as session:
-        waiting = image_retention.has_marked(session)
+        waiting = image_files.has_marked(session)
     note = {"note": "a back-up is being made; files go after it"} if waiting else {}
     return Result(
         {
@@ -45,7 +44,7 @@ def _give_up(context: Context, rule: RetentionRule, counts: Counter[str]) -> int
     size, last = 0, None
     while True:
         with context.runtime.database.writing() as session:
-            batch = image_retention.mark_for_deletion(
+            batch = image_files.mark_for_deletion(
                 session, context.runtime.settings, rule, context.created_by, last
             )
         if batch is None:
@@ -60,7 +59,7 @@ def _remove(context: Context) -> int:
     database, images, removed = context.runtime.database, context.runtime.images, 0
     while True:
         with images.removing() as is_free, database.writing() as session:
-            count = image_retention.remove_marked(session, images) if is_free else 0
+            count = image_files.remove_marked(session, images) if is_free else 0
         if not count:
             return removed
         removed += count
@@ -73,15 +72,14 @@ def due(session: Session, settings: Settings) -> str | None:
     A job is due once a day for old images. It is due once an hour while the quota is exceeded or
     files wait for the end of a back-up.
     """
-    rules, at = image_retention.retention_rules(session, settings), queue.database_time(session)
+    rules, at = image_files.retention_rules(session, settings), queue.database_time(session)
     old = [rule for rule in rules if rule.reason == "age"]
     beyond = [rule for rule in rules if rule.reason == "quota"]
-    if image_retention.has_marked(session) or (
-        image_retention.excess_bytes(session, settings)
-        and image_retention.has_candidates(session, beyond)
+    if image_files.has_marked(session) or (
+        image_files.excess_bytes(session, settings) and image_files.has_candidates(session, beyond)
     ):
         return f"prunings-{at:%Y-%m-%dT%H}"
-    return f"prunings-{at:%Y-%m-%d}" if image_retention.has_candidates(session, old) else None
+    return f"prunings-{at:%Y-%m-%d}" if image_files.has_candidates(session, old) else None
 
 
 KIND = Kind(

@@ -9,7 +9,7 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from model.pointing import Weather
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,
@@ -27,7 +27,7 @@ from service.sources.documents import (
 from service.sources.folder import Importer, MeasurementFolder, read_declared
 from service.sources.plant_errors import PlantText
 from service.sources.plant_formats.imported import PLANT
-from service.sources.plant_types import types_to_json
+from service.sources.plant_parts import types_to_json
 
 
 @dataclass(frozen=True, eq=False)

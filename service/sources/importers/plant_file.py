@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from model.plant import Heliostat, Plant
 from model.plant_model import PlantModel
 from service.base.fields import Elevation, Number, Sun
-from service.base.plant_facts import PlantFacts
+from service.base.plant import PlantFacts
 from service.sources.documents import (
     IMAGE_KINDS,
     SUFFIXES,
@@ -26,7 +26,7 @@ from service.sources.folder import Importer, MeasurementFolder, declared_json
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.imported import PLANT
-from service.sources.plant_types import types_to_json
+from service.sources.plant_parts import types_to_json
 from service.sources.schema import WeatherDocument, parse, parse_time
 
 _ENDING = "-calibration-properties.json"

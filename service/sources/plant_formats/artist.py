@@ -15,13 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from service.base.names import NAME, counted, require_name
+from service.base.validation import NAME, counted, require_name
 from service.sources.folder import MeasuredSurface
 from service.sources.hdf5 import Hdf5Group, open_hdf5
-from service.sources.plant_formats.artist_axes import TILTS, TRANSLATIONS, RigidBody, rigid_body
-from service.sources.plant_formats.artist_mirrors import ArtistMirror
-from service.sources.plant_formats.imported import ImportedPlant, placed, plant_name, site
-from service.sources.plant_formats.mirror_design import MirrorDesign, design_of
+from service.sources.plant_formats.artist_heliostats import (
+    TILTS,
+    TRANSLATIONS,
+    ArtistMirror,
+    RigidBody,
+    rigid_body,
+)
+from service.sources.plant_formats.imported import (
+    ImportedPlant,
+    MirrorDesign,
+    design_of,
+    placed,
+    plant_name,
+    site,
+)
 from service.sources.plant_schema import MAX_FACETS, MAX_HELIOSTATS, HeliostatEntry
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from model.surface import COLUMNS, DEGREE, ROWS, control_points
 from service.sources.files import file_name
 from service.sources.folder import MeasuredSurface, read_surface
 from service.sources.plant_file import PlantDescription
-from service.sources.plant_formats.artist_axes import deviations_of, rigid_body
+from service.sources.plant_formats.artist_heliostats import deviations_of, rigid_body
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,13 @@ from service.sources.files import file_name
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.artist import read_artist
 from service.sources.plant_formats.artist_export import write_artist
+from service.sources.plant_formats.heliostat_lists import (
+    COLUMNS,
+    has_positions,
+    read_opencsp,
+    read_positions,
+)
 from service.sources.plant_formats.imported import ImportedPlant
-from service.sources.plant_formats.opencsp import COLUMNS, read_opencsp
-from service.sources.plant_formats.positions import has_positions, read_positions
 from service.sources.plant_formats.solarpilot import read_solarpilot, solarpilot_layout
 from service.sources.plant_formats.soltrace import is_soltrace, read_soltrace
 from service.sources.plant_formats.soltrace_export import soltrace_text

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
-from service.base.names import counted
+from service.base.validation import counted
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.imported import (
     ImportedPlant,

@@ -19,10 +19,16 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidInputError
 from model.frames import sun_angles
-from service.base.names import NAME, counted
+from service.base.validation import NAME, counted
 from service.sources.files import file_name, read_text, require_regular
-from service.sources.plant_formats.imported import ImportedPlant, placed, site
-from service.sources.plant_formats.mirror_design import FacetedMirror, MirrorDesign, design_of
+from service.sources.plant_formats.imported import (
+    FacetedMirror,
+    ImportedPlant,
+    MirrorDesign,
+    design_of,
+    placed,
+    site,
+)
 from service.sources.plant_formats.soltrace_mirrors import (
     NAMED_STAGE,
     SOLTRACE_TOLERANCE,

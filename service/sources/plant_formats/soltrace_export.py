@@ -19,7 +19,7 @@ from model.receivers import Panels
 from model.sunshape import SOLAR_DISC, Gaussian, Pillbox, SunShape
 from service.sources.plant_file import PlantDescription
 from service.sources.plant_formats.soltrace_mirrors import NAMED_STAGE
-from service.sources.plant_receivers import AnyReceiver
+from service.sources.plant_parts import AnyReceiver
 from service.sources.plant_schema import UP
 
 Array = NDArray[np.float64]

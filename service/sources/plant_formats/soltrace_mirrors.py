@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from model.errors import InvalidInputError
-from service.base.names import NAME
-from service.sources.plant_formats.mirror_design import FacetedMirror, Tolerance, design_of
+from service.base.validation import NAME
+from service.sources.plant_formats.imported import FacetedMirror, Tolerance, design_of
 from service.sources.plant_schema import MAX_FACETS
 from service.sources.text_lines import ForeignLine
 

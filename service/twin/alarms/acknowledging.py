@@ -12,16 +12,15 @@ from sqlalchemy.orm import Session
 from service import store
 from service.base.errors import ConflictError, NotFoundError
 from service.base.fields import Model, Name
-from service.store import acknowledgements
+from service.store import acknowledgements, decisions
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow
 from service.store.rows import lock_heliostat
-from service.store.surfaces import decisions
 from service.store.tables import HeliostatRow, SurfaceRow
 from service.twin.alarms.alarms import Alarm, AlarmList, find_untrusted, untrusted_fingerprint
 from service.twin.alarms.field_overview import read_summaries
 from service.twin.alarms.reasons import REASONS, Reason, Severity
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 
 
 class AlarmFilter(Model):

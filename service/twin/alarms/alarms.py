@@ -29,11 +29,10 @@ from model.times import format_minute
 from service import store
 from service.base.fields import From
 from service.base.settings import Settings
-from service.store import acknowledgements, field_state
+from service.store import acknowledgements, field_state, queue
 from service.store.columns import now
 from service.store.job_tables import AcknowledgementRow, AlarmRow, JobRow
-from service.store.jobs import queue
-from service.store.photographs.measurements import EXCLUDED, has_warning
+from service.store.measurements import EXCLUDED, has_warning
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -46,17 +45,16 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.alarms import offers
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
-from service.twin.alarms.light import LostLight, find_lost_light
-from service.twin.alarms.measured_states import measure_states
+from service.twin.alarms.measured_states import LostLight, find_lost_light, measure_states
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, ReasonOf, SeverityOf
-from service.twin.forecasts.aim_sources import outdated_plans, plant_time_zone
+from service.twin.forecasts.aims import outdated_plans, plant_time_zone
 from service.twin.forecasts.mirror_states import MirrorStates
-from service.twin.plant import model_versions
-from service.twin.pointing.errors import DriveStep, PointingState
-from service.twin.studies.camera_watch import FIGURES, CameraChange, CameraReadings
+from service.twin.pointing_errors import DriveStep, PointingState
+from service.twin.studies.cameras import FIGURES, CameraChange, CameraReadings
 from service.twin.studies.field_change import AdoptableStudy, EffectFindings
 
 AlarmId = Annotated[

@@ -18,7 +18,7 @@ from model.frames import sun_direction
 from model.times import format_minute
 from service import store
 from service.base.settings import Settings
-from service.store.surfaces import decisions
+from service.store import decisions
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -27,27 +27,27 @@ from service.store.tables import (
     StudyRow,
     SurfaceRow,
 )
+from service.twin import model_versions
 from service.twin.alarms import offers
 from service.twin.alarms.alarms import Alarm, read_alarms
 from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.offers import Offer
 from service.twin.alarms.reasons import Reason
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.heliostats.outliers import list_outliers
-from service.twin.plant import model_versions
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.surfaces.accuracy import (
     PhotographComparison,
     photograph_name,
     photographs_of_surface,
     rank_of,
 )
-from service.twin.surfaces.epochs import (
+from service.twin.surfaces.present_shape import (
     DROP,
     AccuracyFall,
     DayOfOthers,
     Epoch,
     current_epoch,
     fell_with_others,
+    list_outliers,
     others_on,
     read_fall,
 )

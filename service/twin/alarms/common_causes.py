@@ -22,7 +22,7 @@ from service import store
 from service.base.settings import Settings
 from service.store.acknowledgements import Key
 from service.store.job_tables import JobRow
-from service.store.photographs.measurements import EXCLUDED
+from service.store.measurements import EXCLUDED
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     HeliostatRow,

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from service.base.fields import Search, drop_empty_fields
 from service.twin.alarms.field_overview import HeliostatOverview
-from service.twin.pointing.errors import NEWEST
+from service.twin.pointing_errors import NEWEST
 from service.twin.surfaces.accuracy import RECENT
 
 

@@ -19,11 +19,10 @@ from model.surface import canting_rises, split_canting
 from service import store
 from service.base.arrays import unpack
 from service.base.errors import BusyError
-from service.base.recent_results import RecentResults
 from service.store import field_state
 from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
-from service.store.surfaces.surface_versions import newest_first
+from service.store.surface_versions import newest_first
 from service.store.tables import (
     HeliostatRow,
     HeliostatStateRow,
@@ -31,12 +30,12 @@ from service.store.tables import (
     MountRow,
     SurfaceRow,
 )
-from service.twin.plant import model_versions
-from service.twin.pointing.errors import MountKey, PointingState, find_pointing
-from service.twin.runtime.background_cache import BackgroundCache
-from service.twin.runtime.runtime import Runtime
+from service.twin import model_versions
+from service.twin.caches import BackgroundCache, RecentResults
+from service.twin.pointing_errors import MountKey, PointingState, find_pointing
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank, accuracy_series, result_key
-from service.twin.surfaces.epochs import FALL, AccuracyFall
+from service.twin.surfaces.present_shape import FALL, AccuracyFall
 
 Result = TypeVar("Result")
 logger = logging.getLogger("heliotwin.service")

@@ -31,8 +31,8 @@ from service.twin.alarms.field_overview import (
     read_marks,
     read_summaries,
 )
-from service.twin.runtime.runtime import Runtime
-from service.twin.studies.camera_watch import CHANGES, CameraChange, camera_watch
+from service.twin.runtime import Runtime
+from service.twin.studies.cameras import CHANGES, CameraChange, camera_watch
 from service.twin.studies.field_change import EffectWatch
 
 logger = logging.getLogger("heliotwin.jobs")

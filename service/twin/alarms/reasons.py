@@ -1,8 +1,12 @@
-"""Reasons of alarms: their labels and severities."""
+"""Reasons of alarms: their labels and severities, and numbers of open alarms by severity."""
 
-from typing import Annotated, Literal, NamedTuple
+from collections import Counter
+from typing import Annotated, Literal, NamedTuple, cast
 
 from pydantic import Field
+from sqlalchemy.orm import Session
+
+from service.store import acknowledgements
 
 Reason = Literal[
     "queue",
@@ -64,3 +68,20 @@ REASONS: dict[Reason, ReasonProperties] = {
     "times_unknown": ReasonProperties("Times unknown", 3),
 }
 """All reasons, the most urgent first."""
+
+
+class AlarmCount:
+    """Numbers of open alarms, which nobody has acknowledged, for the menu of every page.
+
+    ``last`` is that of the newest `read`, which a page shows until its menu asks again.
+    """
+
+    last = 0
+
+    def read(self, session: Session) -> dict[Severity, int]:
+        """The number of open alarms of each severity."""
+        counted: Counter[Severity] = Counter()
+        for reason, count in acknowledgements.count_unacknowledged(session).items():
+            counted[REASONS[cast(Reason, reason)].severity] += count
+        self.last = counted.total()
+        return {severity: counted[severity] for severity in SEVERITIES}

@@ -30,16 +30,16 @@ from service import store
 from service.base.arrays import unpack
 from service.base.errors import ConflictError
 from service.base.fields import Sun
-from service.base.memory import return_memory
+from service.base.processes import return_memory
 from service.base.progress import Report
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import HeliostatRow, MountRow
+from service.twin.engines import Threads, engine_of
 from service.twin.forecasts.mirror_states import MirrorState, MirrorStates, count_sources, in_state
 from service.twin.forecasts.watts import Sunlight, dni_of
-from service.twin.heliostats.stored_mount import as_calibrated
-from service.twin.plant.model_versions import ModelVersion
-from service.twin.runtime.engines import Threads, engine_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.model_versions import ModelVersion
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import as_calibrated
 
 Array = NDArray[np.float64]
 

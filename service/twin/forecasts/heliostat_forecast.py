@@ -25,11 +25,11 @@ from service.store.tables import ForecastRow, HeliostatRow, SurfaceRow
 from service.twin.forecasts.mirror_states import AS_DECLARED, MirrorStates, in_state
 from service.twin.forecasts.requests import ForecastIn, position_of
 from service.twin.forecasts.watts import dni_of, light_watts
-from service.twin.heliostats.measurements import heights_of, load_heliostat_context
-from service.twin.heliostats.stored_mount import load_mount
-from service.twin.plant.model_versions import ModelVersion, get_model
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.measurements import heights_of, load_heliostat_context
+from service.twin.model_versions import ModelVersion, get_model
+from service.twin.operations import Forecast
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import load_mount
 
 
 def _chosen_surface(

@@ -26,7 +26,7 @@ from service.base.fields import (
     SunAt,
     VersionIn,
 )
-from service.base.receivers import PlaneReceiverIn, ReceiverIn
+from service.base.plant import PlaneReceiverIn, ReceiverIn
 from service.twin.forecasts.watts import Sunlight
 
 

@@ -20,20 +20,22 @@ from service.base.fields import JsonObject
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.columns import now
-from service.store.photographs.correction_log import (
-    delete_drift,
-    list_corrections,
-    newest_correction,
-)
-from service.store.photographs.image_files import digest
-from service.store.photographs.measurements import EXCLUDED, images_of_photograph
+from service.store.image_files import digest
+from service.store.measurements import EXCLUDED, images_of_photograph
+from service.store.photographs import delete_drift, list_corrections, newest_correction
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow, TargetRow
-from service.twin.heliostats.metadata import metadata_columns, photograph_from_row, stored_metadata
+from service.twin.model_versions import get_model
 from service.twin.photographs.ingest import measure_photograph, measurement_row
-from service.twin.plant.model_versions import get_model
-from service.twin.runtime.runtime import Runtime
-from service.twin.warnings import find_sun_contradictions, other_warnings, sun_columns
+from service.twin.photographs.metadata import (
+    find_sun_contradictions,
+    metadata_columns,
+    other_warnings,
+    photograph_from_row,
+    stored_metadata,
+    sun_columns,
+)
+from service.twin.runtime import Runtime
 
 Done = TypeVar("Done")
 

@@ -23,25 +23,25 @@ from model.times import format_time
 from service import store
 from service.base.arrays import pack, to_json_value
 from service.base.errors import NotFoundError, StoreFullError, TooLargeError
-from service.base.metrics import ACCURACY, PHOTOGRAPHS, REFUSALS
+from service.base.monitoring import ACCURACY, PHOTOGRAPHS, REFUSALS
 from service.base.settings import Settings
 from service.sources.decode import Pixels
 from service.sources.photograph import IncomingPhotograph
+from service.store import image_files
 from service.store.columns import now
-from service.store.photographs import image_retention
-from service.store.photographs.image_files import digest, media_type
+from service.store.image_files import digest, media_type
 from service.store.rows import Added
 from service.store.tables import NO_IMAGE, ImageRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
-    HeliostatContext,
-    accepted_measurement,
-    load_heliostat_context,
-)
-from service.twin.heliostats.metadata import metadata_columns, submitted_metadata
+from service.twin.measurements import HeliostatContext, accepted_measurement, load_heliostat_context
 from service.twin.photographs.likeness import unlike_warnings
-from service.twin.runtime.runtime import Runtime
+from service.twin.photographs.metadata import (
+    find_sun_contradictions,
+    metadata_columns,
+    submitted_metadata,
+    sun_warnings,
+)
+from service.twin.runtime import Runtime
 from service.twin.surfaces import accuracy
-from service.twin.warnings import find_sun_contradictions, sun_warnings
 
 # Tolerance for a camera's clock that is ahead of the server's clock.
 _AHEAD = timedelta(days=1)
@@ -191,16 +191,13 @@ def _require_quota(session: Session, settings: Settings, sha256: str, size: int)
 
     Otherwise the job `prunings` soon deletes images.
     """
-    if (
-        image_retention.excess_bytes(session, settings, size)
-        and session.get(ImageRow, sha256) is None
-    ):
+    if image_files.excess_bytes(session, settings, size) and session.get(ImageRow, sha256) is None:
         quota = [
             rule
-            for rule in image_retention.retention_rules(session, settings)
+            for rule in image_files.retention_rules(session, settings)
             if rule.reason == "quota"
         ]
-        if not image_retention.has_candidates(session, quota):
+        if not image_files.has_candidates(session, quota):
             raise StoreFullError(
                 f"the store's images have reached their quota of {settings.image_quota_gb:g} GB,"
                 " and the active surfaces were made from all of them; nothing was stored: its"

@@ -13,14 +13,14 @@ from model.errors import ModelError
 from model.metrics import flux_accuracy
 from service.base.arrays import unpack
 from service.base.errors import ServiceError
-from service.store.pointing import mounts
-from service.store.surfaces.surface_versions import current_surfaces
+from service.store import mounts
+from service.store.surface_versions import current_surfaces
 from service.store.tables import UNLIKE_HELIOSTAT, HeliostatRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import AcceptedMeasurement, Array, HeliostatContext
-from service.twin.heliostats.stored_mount import as_calibrated
-from service.twin.runtime.runtime import Runtime
+from service.twin.measurements import AcceptedMeasurement, Array, HeliostatContext
+from service.twin.photographs.metadata import Warnings
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import as_calibrated
 from service.twin.surfaces.accuracy import usual_accuracy
-from service.twin.warnings import Warnings
 
 logger = logging.getLogger("heliotwin.service")
 

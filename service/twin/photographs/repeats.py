@@ -14,20 +14,21 @@ from service.base.errors import ConflictError, GoneError
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.keys import RESERVED
-from service.store.photographs.correction_log import list_corrections, note_change
+from service.store.photographs import list_corrections, note_change
 from service.store.rows import ROUNDS, lock_heliostat
 from service.store.tables import NO_IMAGE, CorrectionRow, HeliostatRow, MeasurementRow
-from service.twin.heliostats.measurements import HeliostatContext, load_heliostat_context
-from service.twin.heliostats.metadata import (
+from service.twin.measurements import HeliostatContext, load_heliostat_context
+from service.twin.photographs.corrections import remeasure
+from service.twin.photographs.ingest import ingest, store_position
+from service.twin.photographs.metadata import (
+    find_sun_contradictions,
     photograph_from_row,
     spot_m,
     stored_metadata,
     submitted_metadata,
+    sun_columns,
 )
-from service.twin.photographs.corrections import remeasure
-from service.twin.photographs.ingest import ingest, store_position
-from service.twin.runtime.runtime import Runtime
-from service.twin.warnings import find_sun_contradictions, sun_columns
+from service.twin.runtime import Runtime
 
 FILLED = "sent again with what was missing"
 

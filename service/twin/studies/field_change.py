@@ -25,15 +25,11 @@ from service import store
 from service.base.errors import ConflictError, ServiceError
 from service.base.fields import MeanGain
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
-from service.twin.heliostats.measurements import (
-    accepted_measurement,
-    heights_of,
-    load_heliostat_context,
-)
-from service.twin.plant import model_versions
-from service.twin.plant.model_versions import Ends, ModelVersion, effect_key, effect_text, without
-from service.twin.runtime.runtime import Runtime
-from service.twin.studies.states import study_states
+from service.twin import model_versions
+from service.twin.measurements import accepted_measurement, heights_of, load_heliostat_context
+from service.twin.model_versions import Ends, ModelVersion, effect_key, effect_text, without
+from service.twin.runtime import Runtime
+from service.twin.studies.adoption import study_states
 from service.twin.surfaces.accuracy import forecasts_of
 
 _DAYS, _A_DAY = 60, 6  # days with photographs, and photographs of each

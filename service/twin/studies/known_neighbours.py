@@ -18,9 +18,9 @@ from model.plant_model import PlantModel
 from model.study import FluxImage
 from service import store
 from service.base.errors import SKIPPED
-from service.store.pointing import mounts
-from service.twin.heliostats.measurements import HeliostatContext
-from service.twin.heliostats.stored_mount import as_calibrated
+from service.store import mounts
+from service.twin.measurements import HeliostatContext
+from service.twin.stored_mount import as_calibrated
 
 Array = NDArray[np.float64]
 

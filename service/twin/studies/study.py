@@ -26,21 +26,21 @@ from service.base.arrays import to_json_value
 from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
 from service.base.fields import Model, Moment, Name, StudyReport, Text, Whole
 from service.base.progress import NamedSteps, Report, no_report
-from service.base.validation_messages import format_validation_error
+from service.base.validation import format_validation_error
 from service.drawing.study_report import study_body
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
-from service.twin.heliostats.measurements import (
+from service.twin import model_versions
+from service.twin.measurements import (
     HeliostatContext,
     accepted_measurement,
     choose_measurements,
     heights_of,
     load_heliostat_context,
 )
-from service.twin.heliostats.stored_mount import mount_at
-from service.twin.plant import model_versions
-from service.twin.plant.model_versions import ModelVersion
-from service.twin.runtime.runtime import Runtime
+from service.twin.model_versions import ModelVersion
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import mount_at
 from service.twin.studies.known_neighbours import load_neighbours, with_neighbours
 
 Surfaces = Literal["measured", "current"]

@@ -23,7 +23,7 @@ from service import store
 from service.base.errors import ServiceError
 from service.base.settings import Settings
 from service.store.listing import EVER, Period
-from service.store.photographs.measurements import PREFERENCE
+from service.store.measurements import PREFERENCE
 from service.store.tables import (
     SUN_CONTRADICTS_TIME,
     UNLIKE_HELIOSTAT,
@@ -33,7 +33,9 @@ from service.store.tables import (
     MountRow,
     SurfaceRow,
 )
-from service.twin.heliostats.measurements import (
+from service.twin import model_versions
+from service.twin.caches import BackgroundCache
+from service.twin.measurements import (
     AcceptedMeasurement,
     Array,
     HeliostatContext,
@@ -41,10 +43,8 @@ from service.twin.heliostats.measurements import (
     heights_of,
     load_heliostat_context,
 )
-from service.twin.plant import model_versions
-from service.twin.runtime.background_cache import BackgroundCache
-from service.twin.runtime.runtime import Runtime
-from service.twin.surfaces.epochs import AccuracyFall, epoch_of, find_accuracy_fall
+from service.twin.runtime import Runtime
+from service.twin.surfaces.present_shape import AccuracyFall, epoch_of, find_accuracy_fall
 
 logger = logging.getLogger("heliotwin.service")
 RECENT = 8

@@ -14,11 +14,11 @@ from model.metrics import flux_accuracy
 from model.study.judging import Gain, few_gain
 from service import store
 from service.base.choices import Method
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
-from service.store.surfaces.surface_versions import NewSurface
+from service.store import decisions
+from service.store.decisions import Justification
+from service.store.surface_versions import NewSurface
 from service.store.tables import MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
+from service.twin.measurements import (
     Array,
     HeliostatContext,
     accepted_measurement,
@@ -26,14 +26,14 @@ from service.twin.heliostats.measurements import (
     load_heliostat_context,
     to_observations,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import (
     forecasts_of,
     held_out_first,
     photograph_name,
     photographs_of_surface,
 )
-from service.twin.surfaces.epochs import epoch_of
+from service.twin.surfaces.present_shape import epoch_of
 
 MIN_HELD_OUT = 5
 """Least number of held-out photographs that can decide which surface is better."""

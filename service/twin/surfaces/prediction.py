@@ -17,13 +17,12 @@ from model.progress import Progress, silent
 from service import store
 from service.base.choices import Method, Selection, require_images
 from service.base.errors import ConflictError
-from service.store import audit
+from service.store import audit, decisions
+from service.store.decisions import Justification
 from service.store.keys import RESERVED
 from service.store.rows import lock_heliostat
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
 from service.store.tables import DecisionRow, MeasurementRow, SurfaceRow
-from service.twin.heliostats.measurements import (
+from service.twin.measurements import (
     HeliostatContext,
     accepted_measurement,
     choose_diverse,
@@ -32,11 +31,10 @@ from service.twin.heliostats.measurements import (
     named_measurements,
     to_observations,
 )
-from service.twin.heliostats.outliers import reject_outliers
-from service.twin.runtime.runtime import Operations, Runtime
+from service.twin.runtime import Operations, Runtime
 from service.twin.surfaces.accuracy import photographs_of_epoch
-from service.twin.surfaces.epochs import Epoch, current_epoch, epoch_of
 from service.twin.surfaces.evaluation import Evaluation, evaluate_first_surface, evaluate_surface
+from service.twin.surfaces.present_shape import Epoch, current_epoch, epoch_of, reject_outliers
 
 # Candidates per requested image, because some may contradict the others.
 _SPARE = 2

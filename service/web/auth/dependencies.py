@@ -19,11 +19,11 @@ from service.base.errors import UnsupportedContentError
 from service.base.fields import MeasurementName, Name, Reason, unique_keys
 from service.jobs.kind import Kinds
 from service.twin.alarms.field_overview import FieldOverviewCache
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.plant.setup import Authorship
-from service.twin.runtime.runtime import Runtime
+from service.twin.forecasts.aims import plant_time_zone
+from service.twin.plant_setup import Authorship
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import ComparisonCache
-from service.web.auth.fair_limiter import FairLimiter
+from service.web.auth.limiters import FairLimiter
 from service.web.auth.security import Identity, Requires, Role, dependencies_of, presented_key
 
 

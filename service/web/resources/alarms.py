@@ -37,17 +37,17 @@ from service.twin.alarms.acknowledging import (
 )
 from service.twin.alarms.alarms import Alarm, AlarmId, AlarmList, read_alarms
 from service.twin.alarms.common_causes import CommonCause, find_common_causes
-from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.reasons import (
     REASONS,
     SEVERITIES,
+    AlarmCount,
     CountByReason,
     HeliostatOrPlant,
     Reason,
     ReasonOf,
     SeverityOf,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     OVERVIEW_SLOT,
@@ -58,10 +58,9 @@ from service.web.auth.dependencies import (
     RuntimeDep,
     require_json,
 )
-from service.web.responses.csv_tables import sheet_answer
+from service.web.responses.lists import AfterId, Page, page, sheet_answer
 from service.web.responses.openapi import problems
 from service.web.responses.pages import count_badge, go_to, render
-from service.web.responses.paging import AfterId, Page, page
 
 router = APIRouter(prefix="/alarms", tags=["alarms"])
 pages = APIRouter(include_in_schema=False)

@@ -11,9 +11,9 @@ from service.base.fields import CreatedAt, Id, Version, from_row
 from service.store import audit, keys
 from service.store.job_tables import KeyRow
 from service.web.auth.dependencies import ADMIN, Limit, RuntimeDep
+from service.web.responses.lists import AfterId, Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
-from service.web.responses.paging import AfterId, Page, page
 
 
 class AuditOut(BaseModel):

@@ -37,19 +37,19 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline, Value
+from service.store import mounts
 from service.store.columns import EPOCH
 from service.store.listing import EVER, NEWEST_FIRST, Period
-from service.store.pointing import mounts
 from service.store.tables import HeliostatRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import SurfaceErrors, field_totals, surface_errors
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import trace_request
 from service.twin.forecasts.requests import ForecastIn
-from service.twin.heliostats.facets import facet_places
-from service.twin.runtime.operations import Forecast
-from service.twin.runtime.runtime import Runtime
+from service.twin.operations import Forecast
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.accuracy import RECENT, ComparisonResult, is_misleading
-from service.twin.surfaces.epochs import epoch_of
+from service.twin.surfaces.present_shape import epoch_of
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     READ,

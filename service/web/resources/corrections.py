@@ -31,17 +31,21 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
-from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
-from service.store.photographs.measurements import count_undated
+from service.store.measurements import count_undated
+from service.store.photographs import list_corrections, made_from, newest_correction
 from service.store.tables import MeasurementRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.photographs.batches import (
     MOST_ENTRIES,
     MOTORS,
     TIMES,
     correct_many,
+    given_time,
     list_batches,
     preview_many,
+    read_motors,
+    read_times,
+    shifted_times,
     undo_batch,
 )
 from service.twin.photographs.corrections import (
@@ -49,9 +53,8 @@ from service.twin.photographs.corrections import (
     correct_photograph,
     correct_photographs,
 )
-from service.twin.photographs.deletion import delete_photograph
-from service.twin.photographs.times import given_time, read_motors, read_times, shifted_times
-from service.twin.runtime.runtime import Runtime
+from service.twin.photographs.stored_photograph import delete_photograph
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -68,9 +71,9 @@ from service.web.auth.dependencies import (
 )
 from service.web.resources.measurements import MeasurementOut, Motors, measurement_out
 from service.web.resources.photographs import PhotographsQuery
+from service.web.responses.lists import Page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import Page
 
 
 class CorrectionIn(WeatherFields, Model):

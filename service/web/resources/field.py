@@ -21,7 +21,6 @@ from service.drawing.charts import CONDITION, ColourScale
 from service.drawing.pictures import places_picture
 from service.drawing.templates import in_zone
 from service.store.tables import HeliostatRow
-from service.twin.alarms.counts import AlarmCount
 from service.twin.alarms.field_filter import (
     CONDITIONS,
     METRICS,
@@ -32,9 +31,9 @@ from service.twin.alarms.field_filter import (
 )
 from service.twin.alarms.field_overview import PATIENCE_S, FieldOverviewCache, HeliostatOverview
 from service.twin.alarms.field_state import PERIODS, Period, field_accuracy, recent_work
-from service.twin.alarms.reasons import SEVERITIES
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.runtime.runtime import Runtime
+from service.twin.alarms.reasons import SEVERITIES, AlarmCount
+from service.twin.forecasts.aims import plant_time_zone
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OVERVIEW_SLOT,
     READ,
@@ -43,10 +42,9 @@ from service.web.auth.dependencies import (
     RuntimeDep,
 )
 from service.web.resources.alarms import AlarmCountDep
-from service.web.responses.csv_tables import sheet_answer
+from service.web.responses.lists import Page, page, sheet_answer
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import Page, page
 
 
 class FieldQuery(HeliostatFilter):

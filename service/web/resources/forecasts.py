@@ -39,23 +39,23 @@ from service.base.fields import (
     from_row,
     plant_time_to_utc,
 )
-from service.base.names import NAME
+from service.base.validation import NAME
 from service.drawing import charts
 from service.drawing.pictures import flux_picture
 from service.drawing.templates import irradiance, times_in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import field_forecasts
 from service.jobs.kinds.field_forecasts import FleetForecastIn
+from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.tables import ForecastRow, HeliostatRow, PlantRow
 from service.twin.alarms.measured_states import read_requested_states
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.heliostat_forecast import camera_view, flux_of, make_forecast, size_of
 from service.twin.forecasts.requests import ForecastIn, position_of
 from service.twin.forecasts.watts import ForecastLosses, Sunlight, loss_chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -68,10 +68,10 @@ from service.web.auth.dependencies import (
 )
 from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.lists import ListQuery, Page, page
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to, leave_for, named_by_field, render
-from service.web.responses.paging import ListQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 
 class ForecastReceiverOut(BaseModel):

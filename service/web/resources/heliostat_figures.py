@@ -23,8 +23,8 @@ from service.drawing.pictures import comparison_picture, mirror_heights
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.store.tables import MeasurementRow, MountRow, SurfaceRow
 from service.twin.alarms.field_overview import FieldTotals, field_totals
-from service.twin.photographs.display import compare_one
-from service.twin.runtime.runtime import Runtime
+from service.twin.photographs.stored_photograph import compare_one
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import PhotographComparison
 from service.twin.surfaces.accuracy import photograph_name as photograph_of
 

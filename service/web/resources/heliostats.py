@@ -19,23 +19,22 @@ from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.facets import FacetPlaces
 from service.drawing.timelines import Timeline
-from service.sources.heliostat_document import HeliostatDocument
-from service.sources.heliostat_of_type import HeliostatOfType
+from service.sources.heliostat_document import HeliostatDocument, HeliostatOfType
 from service.sources.schema import HeliostatProperties
-from service.store import acknowledgements, audit
+from service.store import acknowledgements, audit, decisions, mounts
+from service.store.decisions import Justification, find_comparison
 from service.store.listing import NEWEST_FIRST
-from service.store.photographs.correction_log import list_corrections, newest_correction
-from service.store.photographs.groups import (
+from service.store.photographs import (
     PhotographFilter,
     PhotographGroup,
     PhotographVerdict,
+    list_corrections,
     list_groups,
+    newest_correction,
 )
-from service.store.pointing import mounts
 from service.store.rows import Put
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification, find_comparison
 from service.store.tables import CorrectionRow, DecisionRow, HeliostatRow, MountRow, SurfaceRow
+from service.twin import plant_setup
 from service.twin.alarms import causes
 from service.twin.alarms.causes import (
     HeliostatFacts,
@@ -50,11 +49,10 @@ from service.twin.alarms.field_overview import (
     read_summaries,
     with_pointing,
 )
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.heliostats.facets import facet_places
-from service.twin.plant import setup
-from service.twin.plant.setup import Authorship
-from service.twin.pointing.calibration import CalibrationSlot, best_slot
+from service.twin.calibration import CalibrationSlot, best_slot
+from service.twin.forecasts.aims import plant_time_zone
+from service.twin.plant_setup import Authorship
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.accuracy import ComparisonResult, rank_of
 from service.web.auth.dependencies import (
     OPERATE,
@@ -81,9 +79,9 @@ from service.web.resources.heliostat_figures import (
     version_marks,
     versions,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
-from service.web.responses.paging import Page, page
 
 _FORMS = {
     "heliostat_position": "(paint)",
@@ -160,8 +158,8 @@ def _set(
     replace: bool = True,
 ) -> Put[HeliostatRow]:
     if isinstance(given, HeliostatOfType):
-        return setup.set_heliostat_of_type(session, by, name, given, replace)
-    return setup.set_heliostat(session, by, name, given.raw, replace)
+        return plant_setup.set_heliostat_of_type(session, by, name, given, replace)
+    return plant_setup.set_heliostat(session, by, name, given.raw, replace)
 
 
 router = APIRouter(tags=["heliostats"])
@@ -263,7 +261,7 @@ def delete_heliostat(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> 
     This is refused if photographs, surfaces or anything else refers to it.
     """
     runtime.database.run_in_transaction(
-        lambda session: setup.remove(session, by, "heliostat", name)
+        lambda session: plant_setup.remove(session, by, "heliostat", name)
     )
 
 

@@ -1,9 +1,10 @@
-"""What the page of a job draws of its result, and the tables of it as CSV."""
+"""What pages of jobs and studies draw of their results, and the tables of a job's as CSV."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, time
 from typing import Annotated, Any
+from zoneinfo import ZoneInfo
 
 from fastapi import Query
 from numpy.typing import NDArray
@@ -11,15 +12,16 @@ from sqlalchemy.orm import Session
 
 from model.pointing.report import clock_in_words
 from service.base.arrays import unpack
+from service.base.fields import StudyReport
 from service.drawing import charts
 from service.drawing.charts import HeatMap
 from service.drawing.templates import in_words
 from service.drawing.timelines import Threshold, TimeAxis, Timeline, Value, timeline
 from service.jobs.kinds.aim_plans import MAX_STEPS, step_name
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
-from service.store.pointing.mounts import mounts_of_versions
-from service.twin.pointing.calibration import UndatedCount
+from service.store.mounts import mounts_of_versions
+from service.twin.calibration import UndatedCount
 
 StepNumber = Annotated[
     int, Query(ge=0, lt=MAX_STEPS, description="Which step of a day, from 0; the first without it.")
@@ -266,3 +268,42 @@ def payload_in_words(payload: Mapping[str, object]) -> dict[str, str]:
     return dict(
         _entry(name, value) for name, value in payload.items() if value not in (None, {}, [])
     )
+
+
+def study_timelines(
+    report: StudyReport, taken: Mapping[str, datetime | None], zone: str
+) -> list[Timeline]:
+    """Charts with a known time; ``taken`` has the times of photographs by ``heliostat/id``."""
+    axis = TimeAxis(zone)
+    series = {"before": report.before.per_image}
+    if report.effects:
+        series["after"] = report.after.per_image
+    charts = [
+        timeline(
+            "Accuracy of held-out photographs",
+            "%",
+            {
+                name: [Value(taken.get(key), 100 * value, key) for key, value in some.items()]
+                for name, some in series.items()
+            },
+            1,
+            axis=axis,
+        )
+    ]
+    charts += [
+        timeline(
+            f"{effect.name.replace('_', ' ')}, {name}",
+            fitted.unit,
+            {"by day": [Value(_noon(day, zone), value, day) for day, value in values.items()]},
+            3,
+            axis=axis,
+        )
+        for effect in report.effects
+        for name, fitted in effect.parameters.items()
+        if (values := fitted.by_day)
+    ]
+    return [chart for chart in charts if chart is not None and chart.values]
+
+
+def _noon(day: str, zone: str) -> datetime:
+    return datetime.combine(datetime.fromisoformat(day), time(12), ZoneInfo(zone))

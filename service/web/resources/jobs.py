@@ -25,7 +25,7 @@ from model.fleet import LOSSES
 from service.base.arrays import pack, unpack
 from service.base.errors import NotFoundError
 from service.base.fields import Rows, State, Version
-from service.base.names import KEY
+from service.base.validation import KEY
 from service.drawing.charts import HeatMap
 from service.drawing.pictures import flux_picture
 from service.drawing.templates import in_zone
@@ -33,12 +33,12 @@ from service.jobs.enqueuing import cancel_for, delete_plan_for, enqueue
 from service.jobs.kind import Kind, Kinds, result_of
 from service.jobs.kinds.plans import MAX_TIMES, map_name
 from service.sources.plant_tables import AIM_COLUMNS, DRIVE_COLUMNS
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.sizes import sizes
 from service.twin.forecasts.mirror_states import STATE_COLUMNS, state_rows
 from service.twin.forecasts.watts import loss_chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -65,13 +65,12 @@ from service.web.resources.job_results import (
     payload_in_words,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.job_events import JobStream, JobSummary, Watcher, Watchers, job_summary
+from service.web.responses.lists import ListQuery, OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import TEXT, arrays, problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import ListQuery, OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 
 async def _watchers(request: Request) -> Watchers:

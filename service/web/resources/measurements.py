@@ -42,12 +42,12 @@ from service.drawing.pictures import flux_picture
 from service.sources.photograph import IncomingPhotograph
 from service.sources.schema import WeatherFields, paint_motors
 from service.store.listing import Order, Period
-from service.store.photographs.correction_log import newest_correction
-from service.store.photographs.measurements import MeasurementFilter
+from service.store.measurements import MeasurementFilter
+from service.store.photographs import newest_correction
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.heliostats.metadata import spot_m
+from service.twin.photographs.metadata import spot_m
 from service.twin.photographs.repeats import receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import photograph_name
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -63,12 +63,11 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.files import WholeFile, etag_matches
 from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.lists import OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import BINARY, arrays, problems
-from service.web.responses.paging import OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 Motors = Annotated[
     tuple[Annotated[Number, Field(ge=-1e9, le=1e9)], Annotated[Number, Field(ge=-1e9, le=1e9)]],

@@ -33,7 +33,7 @@ from service.base.fields import (
     Version,
     plant_time_to_utc,
 )
-from service.store.pointing import mounts
+from service.store import mounts
 from service.store.tables import MountRow
 from service.twin.alarms.field_overview import (
     PATIENCE_S,
@@ -41,9 +41,9 @@ from service.twin.alarms.field_overview import (
     read_summaries,
     with_pointing,
 )
+from service.twin.calibration import CalibrationSlot, best_slot, make_plan, mount_out
 from service.twin.forecasts.requests import position_of
-from service.twin.heliostats.stored_mount import load_mount
-from service.twin.pointing.calibration import CalibrationSlot, best_slot, make_plan, mount_out
+from service.twin.stored_mount import load_mount
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     READ,
@@ -54,9 +54,9 @@ from service.web.auth.dependencies import (
     ZoneDep,
     require_json,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import render
-from service.web.responses.paging import Page, page
 
 router = APIRouter(tags=["mounts"])
 pages = APIRouter(include_in_schema=False)

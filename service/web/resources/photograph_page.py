@@ -23,18 +23,21 @@ from service.base.fields import (
 )
 from service.drawing.pictures import photograph_picture
 from service.drawing.templates import in_words
-from service.store.photographs.correction_log import list_corrections, made_from, newest_correction
-from service.store.photographs.measurements import EXCLUDED, images_of_photograph
+from service.store.measurements import EXCLUDED, images_of_photograph
+from service.store.photographs import list_corrections, made_from, newest_correction
 from service.store.tables import CorrectionRow, MeasurementRow
-from service.twin.heliostats.metadata import stored_metadata
 from service.twin.photographs.corrections import (
     GivenCorrection,
     NothingToChangeError,
     correct_photograph,
 )
-from service.twin.photographs.deletion import delete_photograph
-from service.twin.photographs.display import load_for_display, pixels_of
-from service.twin.runtime.runtime import Runtime
+from service.twin.photographs.metadata import stored_metadata
+from service.twin.photographs.stored_photograph import (
+    delete_photograph,
+    load_for_display,
+    pixels_of,
+)
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,

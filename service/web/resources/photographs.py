@@ -34,21 +34,21 @@ from service.base.fields import (
     parse_moment,
     start_of_day,
 )
-from service.base.names import IDENTIFIER
+from service.base.validation import IDENTIFIER
 from service.sources.photograph import IncomingPhotograph
 from service.store import audit
 from service.store.listing import Period
-from service.store.photographs.correction_log import newest_correction
-from service.store.photographs.groups import (
+from service.store.photographs import (
     PhotographFilter,
     PhotographGroup,
     PhotographVerdict,
     count_groups,
     get_group,
     list_groups,
+    newest_correction,
 )
 from service.store.tables import CorrectionRow, HeliostatRow, MeasurementRow
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.requests import position_of
 from service.twin.photographs.corrections import (
     GivenCorrection,
@@ -56,7 +56,7 @@ from service.twin.photographs.corrections import (
     correct_photograph,
 )
 from service.twin.photographs.repeats import ReceivedPhotograph, receive
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
     OPERATE,
@@ -73,9 +73,9 @@ from service.web.resources.measurements import (
     TakenQuery,
     measurement_out,
 )
+from service.web.responses.lists import Page, page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to, render
-from service.web.responses.paging import Page, page
 
 router = APIRouter(prefix="/measurements", tags=["measurements"])
 pages = APIRouter(include_in_schema=False)

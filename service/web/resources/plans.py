@@ -27,13 +27,13 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import aim_plans, plans
 from service.jobs.kinds.aim_plans import AimPlanIn, DayIn
 from service.jobs.kinds.plans import PlanIn, PlanName, ReceiverLoad, map_name
+from service.store import queue
 from service.store.columns import now
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
-from service.twin.forecasts.aim_sources import plant_time_zone
+from service.twin.forecasts.aims import plant_time_zone
 from service.twin.forecasts.watts import LossStage
 from service.twin.forecasts.watts import loss_chain as chain
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth.dependencies import (
     OPERATE,
     READ,

@@ -18,8 +18,7 @@ from model.plant import Plant, TargetPlane
 from model.receivers import Cavity
 from service import store
 from service.base.fields import JsonObject, Model, Plane, TargetOf, Wgs84, from_row
-from service.base.plant_facts import TowerSize
-from service.base.receivers import KIND, ReceiverIn
+from service.base.plant import KIND, ReceiverIn, TowerSize
 from service.drawing.templates import figure
 from service.jobs.kinds import measurements
 from service.jobs.kinds.measurements import MeasurementsIn
@@ -35,14 +34,14 @@ from service.sources.documents import (
 from service.sources.plant_schema import CameraEntry, FacetGridEntry, HeliostatTypeEntry, Marks
 from service.sources.schema import TowerMeasurements
 from service.store import audit
-from service.store.plant.model_versions import declared_of, find_current
+from service.store.model_versions import declared_of, find_current
 from service.store.rows import Put
 from service.store.tables import PlantRow, ReceiverRow, TargetRow
+from service.twin import plant_setup
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
-from service.twin.photographs.camera_choice import read_camera_choice
-from service.twin.plant import setup
-from service.twin.plant.model_versions import CameraAnswer, get_model
-from service.twin.runtime.runtime import Runtime
+from service.twin.model_versions import CameraAnswer, get_model
+from service.twin.runtime import Runtime
+from service.twin.studies.cameras import read_camera_choice
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -53,9 +52,9 @@ from service.web.auth.dependencies import (
     require_json,
     set_tag,
 )
+from service.web.responses.lists import Page
 from service.web.responses.openapi import problems
 from service.web.responses.pages import go_to_job, render
-from service.web.responses.paging import Page
 
 Place = tuple[float, float, float]
 """East, north and up."""
@@ -298,7 +297,7 @@ def put_plant(document: TowerMeasurements, runtime: RuntimeDep, by: AuthorshipDe
 
     def write(session: Session) -> PlantOut:
         plant = Plant(document.power_plant_properties.ID, origin, targets, receivers=receivers)
-        setup.set_plant(session, by, plant, document.declared, corners, facts)
+        plant_setup.set_plant(session, by, plant, document.declared, corners, facts)
         return plant_out(session)
 
     return runtime.database.run_in_transaction(write)
@@ -337,10 +336,10 @@ def put_target(
         if request.corners is not None:
             plane = _from_corners(session, name, request.corners)
             corners = {corner: list(getattr(request.corners, corner)) for corner in _CORNERS}
-            return setup.set_target(session, by, request.located(plane), corners)
+            return plant_setup.set_target(session, by, request.located(plane), corners)
         assert request.plane is not None  # the schema requires one of the two
         plane = request.plane.named(name)
-        return setup.set_target(session, by, request.located(plane))
+        return plant_setup.set_target(session, by, request.located(plane))
 
     row, change = runtime.database.run_in_transaction(write)
     if change is store.Change.NEW:
@@ -360,7 +359,9 @@ def delete_target(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> Non
 
     This is refused if photographs, forecasts or waiting jobs refer to it.
     """
-    runtime.database.run_in_transaction(lambda session: setup.remove(session, by, "target", name))
+    runtime.database.run_in_transaction(
+        lambda session: plant_setup.remove(session, by, "target", name)
+    )
 
 
 @router.get("/receivers", responses=problems(), dependencies=[READ])
@@ -392,7 +393,7 @@ def put_receiver(
     `kind` says which. Without it, the receiver is a cylinder.
     """
     row, change = runtime.database.run_in_transaction(
-        lambda session: setup.set_receiver(session, by, request.named(name))
+        lambda session: plant_setup.set_receiver(session, by, request.named(name))
     )
     if change is store.Change.NEW:
         response.status_code = status.HTTP_201_CREATED
@@ -411,7 +412,9 @@ def delete_receiver(name: NamePath, runtime: RuntimeDep, by: AuthorshipDep) -> N
 
     This is refused if waiting jobs refer to it.
     """
-    runtime.database.run_in_transaction(lambda session: setup.remove(session, by, "receiver", name))
+    runtime.database.run_in_transaction(
+        lambda session: plant_setup.remove(session, by, "receiver", name)
+    )
 
 
 # --- the page

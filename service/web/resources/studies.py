@@ -40,21 +40,23 @@ from service.base.fields import (
     from_row,
     start_of_day,
 )
-from service.base.names import LINE
-from service.drawing.discrepancy_chart import amount_charts
+from service.base.validation import LINE
+from service.drawing.study_charts import amount_charts
 from service.drawing.study_report import VERDICTS, report_page
-from service.jobs.costs import study_cost
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn
 from service.store.tables import PlantRow, StudyRow
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
-from service.twin.studies.changes import (
+from service.twin import model_versions
+from service.twin.forecasts.aims import plant_time_zone
+from service.twin.runtime import Runtime
+from service.twin.studies.adoption import (
     EACH_S,
     AccuracyChange,
+    AdoptionState,
+    StudyState,
     forecast_changes,
     heliostats_to_forecast,
+    study_states,
 )
 from service.twin.studies.field_change import (
     ContradictionError,
@@ -62,7 +64,6 @@ from service.twin.studies.field_change import (
     read_field_change,
     require_no_contradiction,
 )
-from service.twin.studies.states import AdoptionState, StudyState, study_states
 from service.twin.studies.study import MAX_STUDY_IMAGES, StudyIn, Surfaces, extent_of
 from service.web.auth.dependencies import (
     COMPUTE_SLOT,
@@ -72,11 +73,12 @@ from service.web.auth.dependencies import (
     IdentityDep,
     RuntimeDep,
 )
+from service.web.resources.job_results import study_timelines
+from service.web.resources.job_start import study_cost
 from service.web.resources.models import ModelOut, current_out, model_out
-from service.web.resources.study_charts import study_timelines
+from service.web.responses.lists import ListQuery, OrderQuery, Page, page
 from service.web.responses.openapi import TEXT, problems
 from service.web.responses.pages import go_to, go_to_job, named_by_field, render
-from service.web.responses.paging import ListQuery, OrderQuery, Page, page
 
 router = APIRouter(tags=["studies"])
 pages = APIRouter(include_in_schema=False)

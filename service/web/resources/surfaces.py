@@ -35,14 +35,14 @@ from service.base.fields import (
     from_row,
 )
 from service.drawing.pictures import surface_picture
+from service.store import decisions
 from service.store.listing import Order, Period
-from service.store.surfaces import decisions
-from service.store.surfaces.surface_versions import SurfaceFilter
+from service.store.surface_versions import SurfaceFilter
 from service.store.tables import DecisionRow, HeliostatRow, SurfaceRow
 from service.twin.alarms import acknowledging
 from service.twin.alarms.field_overview import field_totals
-from service.twin.heliostats.facets import facet_places
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import facet_places
 from service.twin.surfaces.evaluation import justify_by_hand
 from service.twin.surfaces.prediction import predict_surface
 from service.web.auth.dependencies import (
@@ -60,12 +60,11 @@ from service.web.auth.dependencies import (
     set_tag,
 )
 from service.web.responses import formats
-from service.web.responses.csv_tables import sheet_answer
 from service.web.responses.formats import MediaType, json_answer, maps_answer
+from service.web.responses.lists import AfterId, OrderQuery, Page, page, sheet_answer
 from service.web.responses.openapi import arrays, problems
 from service.web.responses.pages import go_to
-from service.web.responses.paging import AfterId, OrderQuery, Page, page
-from service.web.responses.representation import Maps
+from service.web.responses.representations import Maps
 
 
 class SurfaceIn(Model):

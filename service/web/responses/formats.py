@@ -12,19 +12,17 @@ from pydantic import BaseModel
 
 from service.base.errors import NotAcceptableError
 from service.web.auth.dependencies import render_slot
-from service.web.responses.representation import Maps, Representation
+from service.web.responses.representations import Maps, Representation
 
 JSON = "application/json"
 
-OFFERED = ("npz", "png")
-"""Modules of `representations`, in order of preference if a client accepts several equally."""
+OFFERED = ("representations",)
+"""Modules with `REPRESENTATIONS`, in order of preference if a client accepts several equally."""
 
 _WRITERS: dict[str, Representation] = {
     media_type: representation
     for name in OFFERED
-    for representation in [
-        import_module(f"service.web.responses.representations.{name}").REPRESENTATION
-    ]
+    for representation in import_module(f"service.web.responses.{name}").REPRESENTATIONS
     for media_type in representation.media_types
 }
 

@@ -16,9 +16,9 @@ from starlette.types import Receive, Scope, Send
 
 from service.base.errors import BusyError, TooManyError
 from service.base.fields import CreatedAt, Id, State, from_row
+from service.store import queue
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth import security
 
 # Interval between queries of the store [s], and the silence after which a comment keeps the

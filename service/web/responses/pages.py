@@ -1,4 +1,8 @@
-"""Rendering of templates, and responses for browsers instead of JSON."""
+"""Rendering of templates, and responses for browsers instead of JSON.
+
+A part of a page is a file: ``?table=NAME`` is a table of the page as CSV, and
+``?figure=NAME&format=..`` is a figure.
+"""
 
 import hashlib
 import json
@@ -25,16 +29,43 @@ from starlette.types import Scope
 
 from service.base.arrays import pack
 from service.base.errors import NotFoundError
-from service.base.names import counted
+from service.base.validation import counted
 from service.drawing.charts import Figure
 from service.drawing.templates import ASSETS, environment, form_time, moment, times_in_zone
 from service.jobs.enqueuing import enqueue
 from service.jobs.kind import Kind, Payload
-from service.twin.forecasts.aim_sources import plant_time_zone
-from service.twin.runtime.runtime import Runtime
+from service.twin.forecasts.aims import plant_time_zone
+from service.twin.runtime import Runtime
 from service.web.auth.security import LOCAL, Identity, Role
-from service.web.responses.csv_tables import CSV, Column, PageTable, sheet
-from service.web.responses.fragments import Part
+from service.web.responses.lists import CSV, Column, PageTable, sheet
+
+_NAMES = ("table", "figure", "format")
+
+
+@dataclass(frozen=True)
+class Part:
+    """The requested part of a page: a ``table``, or a ``figure`` in a ``format``."""
+
+    table: str | None = None
+    figure: str | None = None
+    format: str = ""
+
+
+def take_part(scope: Scope) -> None:
+    """Move the requested part of a page from the query to the request state.
+
+    Routes accept only their own query parameters.
+    """
+    if scope["path"].startswith("/v1/") or scope["method"] != "GET":
+        return
+    query = parse_qsl(scope["query_string"].decode("ascii", "replace"), keep_blank_values=True)
+    asked = {name: value for name, value in query if name in _NAMES}
+    if "table" in asked or "figure" in asked:
+        scope["query_string"] = urlencode(
+            [(name, value) for name, value in query if name not in _NAMES]
+        ).encode()
+        scope.setdefault("state", {})["part"] = Part(**asked)
+
 
 # Settings of htmx: no code from text and no inline styles, which the content security policy
 # forbids. Error responses are shown, too.

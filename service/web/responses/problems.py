@@ -24,7 +24,7 @@ from model.errors import (
     WeightsError,
 )
 from service.base import errors
-from service.base.validation_messages import field_of, message_of
+from service.base.validation import field_of, message_of
 from service.store.database import is_deadlock
 from service.web.responses import pages
 

@@ -1,6 +1,7 @@
-"""The page at ``/docs``: Swagger UI from an installed package; the guide at ``/docs/guide``.
+"""Styles and scripts, the page at ``/docs``, and the guide at ``/docs/guide``.
 
-The browser requests nothing from outside the plant.
+The page is Swagger UI from an installed package. The browser requests nothing from outside the
+plant.
 """
 
 import mimetypes
@@ -12,25 +13,34 @@ from fastapi import Path as Parameter
 from fastapi.responses import HTMLResponse
 
 from service.base.errors import NotFoundError
+from service.drawing.templates import ASSETS
 from service.web.auth.dependencies import READ
-from service.web.responses.files import KnownFiles, WholeFile
+from service.web.responses.files import MEDIA_TYPES, KnownFiles, WholeFile
 from service.web.responses.pages import GUIDE, go_to, has_guide
 from service.web.responses.problems import SECURITY_HEADERS
+
+_FOLDER = Path(str(ASSETS))
+
 
 router = APIRouter(include_in_schema=False)
 
 _STATIC = Path(__file__).parent / "static"
 
-MOUNT = (
-    "/docs",
-    KnownFiles(
+MOUNTS = {
+    "/static": KnownFiles(
+        _FOLDER,
+        [path.name for path in _FOLDER.iterdir() if path.suffix in MEDIA_TYPES],
+        # The URL holds a digest of the content, so browsers may cache it without limit.
+        "public, max-age=31536000, immutable",
+    ),
+    "/docs": KnownFiles(
         _STATIC,
         ["swagger-ui.css", "swagger-ui-bundle.js", "start.js", "docs.css"],
         "max-age=3600",
         packages=[("fastapi_offline", "static")],
     ),
-)
-"""Scripts and styles of the page."""
+}
+"""Scripts and styles of all pages, and those of ``/docs``. They need no key."""
 
 
 @router.get("/docs")

@@ -1,4 +1,4 @@
-"""Probes: whether the process lives, and whether it can work."""
+"""Probes and metrics: whether the process lives and can work, and its figures for Prometheus."""
 
 import logging
 from collections.abc import Callable
@@ -6,14 +6,17 @@ from typing import Literal
 
 from anyio import CapacityLimiter, Lock, to_thread
 from fastapi import APIRouter, Request, Response, status
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from pydantic import BaseModel, Field
 
 from model.errors import WeightsError
 from model.network.predictor import default_predictor
 from model.prior import default_prior
 from service.base.errors import StoreDamagedError
-from service.twin.runtime.runtime import Runtime
-from service.web.auth.dependencies import RuntimeDep
+from service.twin.runtime import Runtime
+from service.web.auth.dependencies import OVERVIEW_SLOT, READ, FieldCacheDep, RuntimeDep
+from service.web.responses.openapi import TEXT
+from service.web.store_metrics import registry
 
 
 class Health(BaseModel):
@@ -112,3 +115,19 @@ async def get_readyz(request: Request, runtime: RuntimeDep, response: Response) 
     if not is_ready:
         response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
     return Health(status="ok" if is_ready else "unavailable", checks=checks)
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "Prometheus' text format.",
+            "content": {"text/plain": {"schema": TEXT}},
+        }
+    },
+    dependencies=[READ, OVERVIEW_SLOT],
+)
+def get_metrics(runtime: RuntimeDep, cache: FieldCacheDep) -> Response:
+    """Get metrics for Prometheus. They are of this process, the job queue, and drifts."""
+    return Response(generate_latest(registry(runtime, cache)), media_type=CONTENT_TYPE_LATEST)

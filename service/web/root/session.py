@@ -1,20 +1,24 @@
-"""Sessions for pages, in a cookie.
+"""Sessions for pages, in a cookie, and the login page.
 
-Scripts cannot read the cookie, and pages of other sites cannot use it.
+Scripts cannot read the cookie, and pages of other sites cannot use it. The login page needs no key
+and shows nothing of the plant.
 """
 
+import re
 from datetime import timedelta
 from http import HTTPStatus
 from typing import Annotated
 
-from fastapi import APIRouter, Form, HTTPException, Request, Response, status
+from fastapi import APIRouter, Form, HTTPException, Query, Request, Response, status
+from fastapi.responses import HTMLResponse
 
 from service.base.fields import Text
 from service.store import audit, keys, sessions
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.auth import security
-from service.web.auth.dependencies import RuntimeDep
+from service.web.auth.dependencies import PresentedDep, RuntimeDep
 from service.web.responses.openapi import problems
+from service.web.responses.pages import go_to, render
 
 router = APIRouter(tags=["session"])
 
@@ -95,3 +99,63 @@ def post_session(
 def delete_session(request: Request, runtime: RuntimeDep, response: Response) -> None:
     """End the session. Copies of its cookie are no longer valid."""
     end_session(runtime, request, response)
+
+
+# A path of this service, and nothing that a browser could read as another host.
+_OWN_PATH = re.compile(r"/(?:[A-Za-z0-9_-][A-Za-z0-9_/-]*)?(?:\?[A-Za-z0-9_=&.%-]*)?")
+
+
+def own_path(wanted: str) -> str:
+    """The path to continue to, or the field page if the link holds anything else."""
+    return wanted if _OWN_PATH.fullmatch(wanted) else "/"
+
+
+_WRONG = "This key is not valid: it may be mistyped, expired or withdrawn. Ask for another."
+_ENDED = (
+    "The session of this browser has ended: its time is over, or that of its key. Log in again."
+)
+
+
+def _form(request: Request, next_: str, trouble: str = "") -> HTMLResponse:
+    page = render(request, "login.html", next=own_path(next_), trouble=trouble)
+    page.status_code = HTTPStatus.UNAUTHORIZED if trouble == _WRONG else HTTPStatus.OK
+    return page
+
+
+@router.get("/login", include_in_schema=False)
+def get_login(
+    request: Request,
+    runtime: RuntimeDep,
+    presented: PresentedDep,
+    next_: Annotated[Text, Query(alias="next")] = "/",
+) -> HTMLResponse:
+    """The login form. It says so if the session of the browser is no longer valid."""
+    has_ended = (
+        presented is not None
+        and security.identify(runtime.database, runtime.settings, presented) is None
+    )
+    return _form(request, next_, _ENDED if has_ended else "")
+
+
+@router.post("/login", include_in_schema=False)
+def post_login(
+    key: Annotated[Text, Form(max_length=200)],
+    request: Request,
+    runtime: RuntimeDep,
+    next_: Annotated[Text, Form(alias="next")] = "/",
+) -> Response:
+    """Begin a session with a valid key and continue; otherwise show the form again."""
+    token = begin_session(runtime, request, key.strip())
+    if token is None:
+        return _form(request, next_, _WRONG)
+    answer = go_to(own_path(next_))
+    keep_session(answer, request, token)
+    return answer
+
+
+@router.post("/logout", include_in_schema=False)
+def post_logout(request: Request, runtime: RuntimeDep) -> Response:
+    """End the session."""
+    answer = go_to("/login")
+    end_session(runtime, request, answer)
+    return answer

@@ -13,7 +13,7 @@ from heliotwin.folder_store import open_folder
 from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
 from service.sources.folder import MeasurementFolder, read_folder
-from service.sources.juelich import CENTERED_SIZE_ERROR, CENTERED_WINDOW
+from service.sources.photograph import CENTERED_SIZE_ERROR, CENTERED_WINDOW
 
 
 @pytest.fixture

@@ -22,11 +22,7 @@ from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import PLANT
 from service.store.columns import now
 from service.store.tables import HeliostatRow, MeasurementRow
-from service.twin.heliostats.measurements import (
-    accepted_measurement,
-    heights_of,
-    load_heliostat_context,
-)
+from service.twin.measurements import accepted_measurement, heights_of, load_heliostat_context
 from service.twin.surfaces.accuracy import forecasts_of
 from tests.conftest import made_once
 from tests.service.conftest import until

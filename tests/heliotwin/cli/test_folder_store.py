@@ -16,11 +16,11 @@ from heliotwin.folder_study import photographs_of
 from service.base.arrays import unpack
 from service.base.settings import Settings
 from service.sources.folder import read_folder
-from service.twin.pointing.calibration import calibrate_store
-from service.twin.runtime.runtime import Runtime
+from service.twin.calibration import calibrate_store
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, load_study_inputs
 from service.twin.surfaces.prediction import predict_surface
-from service.twin.transfer.importing import import_folder
 from tests.service.conftest import QUIET
 
 

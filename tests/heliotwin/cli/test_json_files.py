@@ -22,7 +22,7 @@ from service.sources.documents import (
     read_receivers,
     read_targets,
 )
-from service.twin.plant.model_versions import ModelVersion
+from service.twin.model_versions import ModelVersion
 from service.twin.studies.study import row_of_report
 from tests.service.conftest import ORIGIN, properties_document, tower_document
 from tests.service.wrong import RAW, wrong_somewhere

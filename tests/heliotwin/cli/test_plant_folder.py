@@ -8,7 +8,7 @@ import pytest
 
 from model.locating import locator_to_json
 from model.surface import control_points
-from service.base.receivers import receiver_to_json
+from service.base.plant import receiver_to_json
 from service.sources.folder import read_folder
 from service.sources.heliostat_document import heliostat_to_json
 from service.sources.plant_file import read_plant

@@ -31,10 +31,10 @@ from model.surface import control_points
 from service.base.errors import ConflictError
 from service.base.settings import Settings
 from service.sources.folder import read_folder
-from service.twin.heliostats.stored_mount import load_mount
-from service.twin.pointing.calibration import calibrate_store, make_plan
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin.calibration import calibrate_store, make_plan
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
+from service.twin.stored_mount import load_mount
 from tests.heliotwin.cli.motor_folder import write, write_measurement
 from tests.service.conftest import QUIET, properties_document, tower_document
 from tests.service.spots import photographs

@@ -10,9 +10,9 @@ import pytest
 
 HEAPS = """
 import ctypes, sys, threading
-from service.base import memory
+from service.base import processes
 libc = ctypes.CDLL(None)
-limited = memory.limit_memory() if "limit" in sys.argv else None
+limited = processes.limit_memory() if "limit" in sys.argv else None
 libc.malloc.restype = ctypes.c_void_p
 ready = threading.Barrier(13)
 def take():
@@ -47,16 +47,16 @@ def heaps(*arguments: str, **more: str) -> tuple[int, str]:
 RETURNED = """
 import os, time
 from pathlib import Path
-from service.base import memory
+from service.base import processes
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-memory.limit_memory()
+processes.limit_memory()
 blocks = [b"1" * 60_000 for _ in range(2_000)]  # zeros may take no memory
 highest = resident()
 del blocks[:-1]  # the last one keeps the heap as large as it is
 print(highest - resident())
-memory._RETURN_EVERY_S = 0.01
-with memory.returning_memory():
+processes._RETURN_EVERY_S = 0.01
+with processes.returning_memory():
     while highest - resident() < 100e6:
         time.sleep(0.01)
 print(highest - resident())

@@ -22,13 +22,13 @@ from prometheus_client import CollectorRegistry
 
 from model.errors import InvalidInputError
 from service import store
-from service.base import logs, metrics, telemetry
+from service.base import monitoring
 from service.base.errors import NotStartedError
-from service.base.metrics import serve_metrics
+from service.base.monitoring import serve_metrics
 from service.base.settings import Settings
-from service.store.jobs.queue import add_job
+from service.store.queue import add_job
 from service.store.tables import DriftRow, HeliostatRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web import store_metrics
 from tests.service.conftest import FakeOperations, Post, client_of, free_port, png
 from tests.service.metrics import samples, value
@@ -110,7 +110,7 @@ def test_metrics_need_a_key_where_there_are_keys(client: TestClient, app: FastAP
 def test_port_for_metrics_opens_and_closes(tmp_path: Path):
     settings = Settings(data_dir=tmp_path, metrics_port=free_port())
     url = f"http://127.0.0.1:{settings.metrics_port}/metrics"
-    with serve_metrics(settings, metrics.PROCESS):
+    with serve_metrics(settings, monitoring.PROCESS):
         assert "heliotwin_job_seconds" in httpx.get(url).text
     with pytest.raises(httpx.ConnectError):
         httpx.get(url)
@@ -252,7 +252,7 @@ def log(request: pytest.FixtureRequest) -> Iterator[tuple[str, io.StringIO]]:
     stream, root = io.StringIO(), logging.getLogger()
     handlers, level = root.handlers[:], root.level
     root.handlers = []
-    logs.configure_logging(Settings(log_format=request.param))
+    monitoring.configure_logging(Settings(log_format=request.param))
     root.handlers[0].setStream(stream)  # type: ignore[attr-defined]
     yield request.param, stream
     root.handlers, root.level = handlers, level
@@ -332,7 +332,7 @@ def test_requests_and_the_model_are_traced(
 ):
     exporter, provider = InMemorySpanExporter(), TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(exporter))
-    monkeypatch.setattr(metrics, "_tracer", provider.get_tracer("test"))
+    monkeypatch.setattr(monitoring, "_tracer", provider.get_tracer("test"))
     post(png(1))
     assert {span.name for span in exporter.get_finished_spans()} == {"wait", "measure"}
 
@@ -340,9 +340,9 @@ def test_requests_and_the_model_are_traced(
 def test_without_the_extra_packages_the_setting_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    telemetry.configure_tracing(Settings(data_dir=tmp_path), "test")
+    monitoring.configure_tracing(Settings(data_dir=tmp_path), "test")
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
     with pytest.raises(NotStartedError, match=r"heliotwin\[otel\]"):
-        telemetry.configure_tracing(
+        monitoring.configure_tracing(
             Settings(data_dir=tmp_path, otlp_endpoint="http://127.0.0.1:1"), "test"
         )

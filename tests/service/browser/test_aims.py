@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from service.sources.folder import read_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from service.web.app import create_app
 from tests.service import real
 from tests.service.browser.browsing import (

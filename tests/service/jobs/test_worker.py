@@ -29,11 +29,11 @@ from service.jobs import heartbeat
 from service.jobs.enqueuing import enqueue
 from service.jobs.kinds.predictions import EACH_S
 from service.jobs.worker import Worker, Workers, pause_s
+from service.store import queue
 from service.store.database import Database
 from service.store.job_tables import AuditRow, JobRow
-from service.store.jobs import queue
-from service.twin.runtime.runtime import Runtime
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.runtime import Runtime
+from service.twin.slots import ComputeSlots
 from tests.forked import ForkedProcess, forked_process
 from tests.service import job_kinds, real
 from tests.service.conftest import FakeOperations
@@ -594,7 +594,7 @@ def test_stopped_worker_puts_its_job_back(runtime: Runtime):
 
 def away_twice(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The database does not answer the first two calls of this function of
-    `service.store.jobs.queue`.
+    `service.store.queue`.
     """
     real, calls = getattr(queue, name), itertools.count(1)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from model.errors import InvalidInputError
 from service.base.errors import TooLargeError
-from service.sources.archive import unpack_archive
+from service.sources.files import unpack_archive
 
 MAX_BYTES = 10_000
 DIRECTORY, LOCAL, END = b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06"

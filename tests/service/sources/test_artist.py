@@ -15,8 +15,8 @@ from model.surface import basis, control_points, heights, nominal_heights
 from service.sources.folder import measured_heights, read_surface
 from service.sources.plant_file import PlantDescription, read_plant
 from service.sources.plant_formats.artist import read_artist
-from service.sources.plant_formats.artist_axes import ON_ITS_SIDE, first_tilt
 from service.sources.plant_formats.artist_export import write_artist
+from service.sources.plant_formats.artist_heliostats import ON_ITS_SIDE, first_tilt
 from service.sources.plant_formats.formats import read_foreign
 from tests.service.command import ends, heliotwin
 from tests.service.sources.plant_files import PLANT, THREE_MOUNTS, write_plant, write_three_mounts

@@ -14,8 +14,8 @@ import pytest
 from model.errors import InvalidInputError
 from model.plant import Heliostat
 from service.base.arrays import pack, unpack_untrusted
-from service.sources.deflectometry import read_deflectometry
 from service.sources.folder import read_surface
+from service.sources.hdf5 import read_deflectometry
 
 HELIOSTAT = Heliostat.juelich("AA39", [0.0, 60.0, 0.0], 60.0)
 

@@ -12,8 +12,8 @@ from service.base.settings import Settings
 from service.sources import documents
 from service.sources.files import require_regular
 from service.sources.folder import read_declared, read_folder
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from tests.service.conftest import (
     FakeOperations,
     paint_measurement,

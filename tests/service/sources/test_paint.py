@@ -14,7 +14,6 @@ from model.metrics import surface_error
 from model.sunshape import Buie, Gaussian, Pillbox
 from model.sunshape.buie import chi_of_csr
 from model.surface import control_points, evaluate
-from service.sources.deflectometry import read_deflectometry
 from service.sources.documents import (
     optics_to_json,
     read_heliostat,
@@ -25,6 +24,7 @@ from service.sources.documents import (
     read_tower_base,
 )
 from service.sources.folder import measured_heights, read_declared, read_folder
+from service.sources.hdf5 import read_deflectometry
 from tests.conftest import flat_heliostat
 from tests.service.conftest import properties_document, tower_document
 

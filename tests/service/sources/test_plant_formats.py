@@ -12,7 +12,7 @@ from model.errors import InvalidInputError
 from model.frames import sun_angles
 from model.plant import Cylinder
 from model.receivers import Cavity, Panels
-from service.drawing.plant_picture import surface_lines
+from service.drawing.pictures import surface_lines
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.formats import (
     ExportOptions,

@@ -10,8 +10,8 @@ import pytest
 from model.errors import InvalidInputError
 from model.plant import Heliostat
 from model.surface import basis, control_points, evaluate
-from service.sources.deflectometry import SOFAST_SHAPE
 from service.sources.folder import read_folder, read_surface
+from service.sources.hdf5 import SOFAST_SHAPE
 from service.sources.plant_file import read_plant
 from tests.service.sources import plant_files
 

@@ -10,9 +10,9 @@ from sqlalchemy import URL
 
 from service import store
 from service.base.settings import Settings
-from service.store.jobs import queue
+from service.store import queue
 from service.twin.photographs.ingest import ingest
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from tests.service.conftest import (
     ORIGIN,

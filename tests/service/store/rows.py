@@ -8,7 +8,7 @@ from model.plant import TargetPlane
 from service import store
 from service.base.arrays import pack
 from service.store.database import Database
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.surface_versions import NewSurface
 from service.store.tables import (
     ForecastRow,
     HeliostatRow,

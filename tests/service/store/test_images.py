@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.base.errors import StoreDamagedError, UnsupportedImageError
-from service.store.photographs.image_files import ImageStore, media_type
+from service.store.image_files import ImageStore, media_type
 from tests.service.conftest import png
 
 

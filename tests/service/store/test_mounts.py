@@ -7,8 +7,8 @@ import pytest
 
 from service import store
 from service.base.errors import NotFoundError
+from service.store import mounts
 from service.store.database import Database
-from service.store.pointing import mounts
 from tests.service.conftest import ORIGIN
 
 

@@ -22,20 +22,18 @@ from service.jobs.kinds import KINDS
 from service.jobs.kinds.prunings import PruningsIn, prune
 from service.jobs.worker import Worker
 from service.sources.photograph import IncomingPhotograph
-from service.store import audit, sizes
+from service.store import audit, image_files, queue, sizes
+from service.store.backup import back_up, restore
+from service.store.check import inspect_store
 from service.store.columns import now
 from service.store.database import Database
+from service.store.image_files import ImageStore, digest
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
 from service.store.keys import RESERVED
-from service.store.photographs import image_retention
-from service.store.photographs.image_files import ImageStore, digest
-from service.store.recovery.backup import back_up, restore
-from service.store.recovery.check import inspect_store
 from service.store.tables import ImageRow, MeasurementRow
+from service.twin import plant_setup
 from service.twin.photographs.ingest import ingest
-from service.twin.plant import setup
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
 from tests.service.conftest import png, properties_document, sun_at
 from tests.service.store.stores import PHOTOGRAPH
@@ -75,7 +73,9 @@ def give(runtime: Runtime, *seeds: int) -> None:
 def give_to_another(runtime: Runtime, heliostat: str, data: bytes) -> tuple[MeasurementRow, bool]:
     """The same image, which this heliostat has, too."""
     with runtime.database.writing() as session:
-        setup.set_heliostat(session, setup.Authorship("tester"), heliostat, properties_document())
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester"), heliostat, properties_document()
+        )
     return ingest(
         runtime,
         heliostat,
@@ -326,7 +326,9 @@ def test_image_of_two_photographs_is_accepted_where_one_is(runtime: Runtime):
         row = session.scalars(
             select(MeasurementRow).where(MeasurementRow.image_sha256 == digest(picture(50)))
         ).one()
-        setup.set_heliostat(session, setup.Authorship("tester"), "AB38", properties_document())
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester"), "AB38", properties_document()
+        )
         heliostat, target = store.get_heliostat(session, "AB38"), store.get_target(session, "lower")
         image = session.get_one(ImageRow, row.image_sha256)
         again = MeasurementRow(
@@ -348,5 +350,5 @@ def test_nothing_is_given_up_where_the_settings_keep_all(runtime: Runtime):
     age(runtime, 30_000, 1, 2, 3, 9)
     forever = with_(runtime)
     with runtime.database.reading() as session:
-        assert image_retention.retention_rules(session, forever.settings) == []
+        assert image_files.retention_rules(session, forever.settings) == []
     assert do(forever)["images"] == 0

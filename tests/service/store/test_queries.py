@@ -16,14 +16,13 @@ from model.errors import InvalidInputError
 from service import store
 from service.base.arrays import pack, unpack
 from service.base.errors import ConflictError, NotFoundError
-from service.store import keys
+from service.store import keys, queue
 from service.store.columns import now
 from service.store.database import Database
 from service.store.job_tables import KeyRow
-from service.store.jobs import queue
-from service.store.photographs.measurements import MeasurementFilter
+from service.store.measurements import MeasurementFilter
 from service.store.rows import Change
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatRow, SurfaceRow, TargetRow
 from tests.service.conftest import ORIGIN
 from tests.service.store.rows import PLANE, new

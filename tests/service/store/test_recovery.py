@@ -17,15 +17,15 @@ from heliotwin.cli.main import app as cli
 from model.errors import InvalidInputError
 from service.base.errors import ConflictError
 from service.base.settings import Settings
+from service.store import queue
+from service.store.backup import back_up, images_of, restore
+from service.store.check import inspect_store
 from service.store.columns import Base
 from service.store.database import Database
 from service.store.job_tables import JobRow, JobStepRow
-from service.store.jobs import queue
-from service.store.recovery.backup import back_up, images_of, restore
-from service.store.recovery.check import inspect_store
 from service.store.tables import MeasurementRow
 from service.twin.photographs.ingest import ingest
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from tests.service.conftest import png
 from tests.service.store.stores import PHOTOGRAPH
 
@@ -150,7 +150,7 @@ def test_restore_that_is_interrupted_can_be_tried_again(
     on_sqlite = elsewhere.database.get_backend_name() == "sqlite"
     with monkeypatch.context() as broken:
         broken.setattr(
-            "shutil.copyfile" if on_sqlite else "service.store.recovery.backup._copy_in", interrupt
+            "shutil.copyfile" if on_sqlite else "service.store.backup._copy_in", interrupt
         )
         with pytest.raises(KeyboardInterrupt):
             restore(elsewhere, tmp_path / "one")

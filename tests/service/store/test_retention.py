@@ -10,13 +10,12 @@ from sqlalchemy import select, update
 
 from service.base.settings import Settings
 from service.jobs.worker import Worker
-from service.store import audit, record_retention
+from service.store import audit, deletion, queue
 from service.store.columns import now
 from service.store.database import Database
 from service.store.job_tables import AuditRow, JobRow
-from service.store.jobs import queue
 from service.store.tables import ForecastRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from tests.service.conftest import FakeOperations
 from tests.service.store.rows import fill
 
@@ -45,7 +44,7 @@ def test_old_forecasts_go_a_few_at_a_time_and_the_newest_stays(database: Databas
     year = timedelta(days=365)
     for most, expected in ((1, 1), (500, 3), (500, 0)):
         with database.writing() as session:
-            assert record_retention.prune_forecasts(session, year, most) == expected
+            assert deletion.prune_forecasts(session, year, most) == expected
     assert numbers(database) == [ids[1], ids[5]]
 
 
@@ -58,7 +57,7 @@ def test_old_jobs_go_and_that_is_noted(database: Database):
         )
     for expected in (2, 1, 0):  # the newest stays, so that no number is given twice
         with database.writing() as session:
-            assert record_retention.prune_jobs(session, timedelta(days=90), most=2) == expected
+            assert deletion.prune_jobs(session, timedelta(days=90), most=2) == expected
     with database.reading() as session:
         noted = [
             (entry.action, entry.subject, entry.detail) for entry in audit.entries(session, 10)
@@ -73,7 +72,7 @@ def test_old_entries_go_and_that_is_noted(database: Database):
             audit.record(session, "tester", "plant.set", f"plant {number}")
     age(database)
     with database.writing() as session:
-        assert record_retention.prune_audit(session, timedelta(days=365)) == 3
+        assert deletion.prune_audit(session, timedelta(days=365)) == 3
     with database.reading() as session:
         assert [entry.action for entry in audit.entries(session, 10)] == [
             "audit.pruned",

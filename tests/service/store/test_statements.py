@@ -8,11 +8,11 @@ import pytest
 from sqlalchemy import inspect
 
 from service import store
+from service.store.check import inspect_store
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
-from service.store.recovery.check import inspect_store
-from service.twin.heliostats.measurements import named_measurements
-from service.twin.plant import model_versions
+from service.store.image_files import ImageStore
+from service.twin import model_versions
+from service.twin.measurements import named_measurements
 from service.twin.studies.study import StudyIn, load_study_inputs
 from service.twin.surfaces.accuracy import held_out_first
 from tests.service.statements import statements

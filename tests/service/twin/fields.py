@@ -11,8 +11,8 @@ from model.plant import Heliostat, Plant
 from model.surface import control_points
 from service import store
 from service.store.database import Database
-from service.store.surfaces.surface_versions import NewSurface
-from service.twin.runtime.runtime import Runtime
+from service.store.surface_versions import NewSurface
+from service.twin.runtime import Runtime
 
 
 def heights(rng: np.random.Generator) -> np.ndarray:

@@ -3,8 +3,7 @@
 import pytest
 
 from service.store.results import StudyFindings
-from service.twin.plant.adoption_rules import names_of, why_refused
-from service.twin.plant.open_questions import open_questions
+from service.twin.adoption_rules import names_of, open_questions, why_refused
 
 BETTER, WORSE = {"before": 0.90, "after": 0.95}, {"before": 0.931, "after": 0.92}
 

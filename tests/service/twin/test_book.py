@@ -8,7 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.twin.alarms import field_overview
-from service.twin.runtime.background_cache import BackgroundCache
+from service.twin.caches import BackgroundCache
 from tests.service.conftest import FakeOperations, Post, png, sun_at
 from tests.waiting import WAIT_LIMIT_S, until
 

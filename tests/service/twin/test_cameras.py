@@ -13,7 +13,7 @@ from service import store
 from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.studies.camera_watch import FIGURES, find_camera_change
+from service.twin.studies.cameras import FIGURES, find_camera_change
 from tests.service.web.pages import HTML
 
 SETTINGS = Settings()

@@ -17,7 +17,7 @@ from model.sunshape import Buie, Gaussian, Pillbox, SunShape
 from model.surface import control_points
 from model.tracing import Optics
 from model.tracing.convolution import central_rays
-from service.twin.runtime import operations
+from service.twin import operations
 
 PLANE = TargetPlane(
     "target", np.array([0.0, -3, 40]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), 8.0, 7.0

@@ -6,7 +6,7 @@ from model.images import normalized
 from model.observation import Observation
 from model.plant import Heliostat, TargetPlane
 from model.plant_model import JUELICH_MODEL
-from service.twin.heliostats.outliers import list_outliers, reject_outliers
+from service.twin.surfaces.present_shape import list_outliers, reject_outliers
 
 
 def test_outlier_contradicts_the_others():

@@ -24,7 +24,7 @@ from model.surface import control_points
 from service.base.errors import ConflictError
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
-from service.twin.runtime.engines import Ray, Threads, engine_of
+from service.twin.engines import Ray, Threads, engine_of
 from tests.conftest import target
 from tests.service.twin.fields import FLEET, runtime_of
 

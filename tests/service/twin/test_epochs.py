@@ -10,15 +10,16 @@ import pytest
 from service import store
 from service.base.errors import ConflictError
 from service.base.settings import Settings
+from service.store import decisions
 from service.store.database import Database
-from service.store.pointing.mounts import CalibrationState
-from service.store.surfaces import decisions
-from service.store.surfaces.decisions import Justification
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.decisions import Justification
+from service.store.mounts import CalibrationState
+from service.store.surface_versions import NewSurface
 from service.store.tables import HeliostatStateRow
 from service.twin.alarms.causes import _confirming
-from service.twin.pointing.calibration import _reason
-from service.twin.surfaces.epochs import (
+from service.twin.calibration import _reason
+from service.twin.surfaces.prediction import _begin_of_epoch
+from service.twin.surfaces.present_shape import (
     FALL,
     AccuracyFall,
     Epoch,
@@ -27,7 +28,6 @@ from service.twin.surfaces.epochs import (
     find_accuracy_fall,
     waiting_epochs,
 )
-from service.twin.surfaces.prediction import _begin_of_epoch
 from tests.service.conftest import ORIGIN, properties_document
 from tests.service.store.rows import PLANE, new
 from tests.service.studies import add as add_study

@@ -14,7 +14,7 @@ from model.imaging.window import center_of_mass, flux_window
 from model.plant_model import JUELICH_MODEL
 from model.setup import Setup
 from model.surface import control_points
-from service.twin.heliostats.measurements import AcceptedMeasurement, to_observations
+from service.twin.measurements import AcceptedMeasurement, to_observations
 from tests.conftest import flat_heliostat, target
 
 

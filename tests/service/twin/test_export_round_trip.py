@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from service import store
 from service.base.settings import Settings
-from service.store.pointing.mounts import add_mount
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.mounts import add_mount
+from service.store.surface_versions import NewSurface
 from service.store.tables import UNLIKE_HELIOSTAT
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service import exported, real
 from tests.service.conftest import (

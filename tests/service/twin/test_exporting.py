@@ -28,14 +28,14 @@ from service.base.fields import Sun
 from service.base.settings import Settings
 from service.sources.folder import read_folder, read_surface
 from service.sources.photograph import IncomingPhotograph
-from service.store.pointing.mounts import add_mount
-from service.store.surfaces.surface_versions import NewSurface
-from service.twin.heliostats.measurements import load_heliostat_context
+from service.store.mounts import add_mount
+from service.store.surface_versions import NewSurface
+from service.twin import model_versions
+from service.twin.exporting import export_folder
+from service.twin.importing import import_folder
+from service.twin.measurements import load_heliostat_context
 from service.twin.photographs.ingest import ingest
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.exporting import export_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.conftest import made_once
 from tests.service.conftest import (

@@ -15,9 +15,9 @@ from service.jobs.kinds import KINDS, field_forecasts
 from service.jobs.worker import Worker
 from service.sources.documents import read_receivers
 from service.sources.folder import read_folder
-from service.store.jobs import queue
+from service.store import queue
+from service.twin import model_versions
 from service.twin.forecasts import field_forecast
-from service.twin.plant import model_versions
 from tests.service.conftest import FakeOperations, Post, png
 from tests.service.studies import add, adopt
 from tests.service.twin.fields import FIELD, FLEET, SUN, runtime_of

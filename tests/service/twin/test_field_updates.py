@@ -18,7 +18,7 @@ from service.store.columns import now
 from service.store.job_tables import AlarmRow
 from service.store.tables import HeliostatRow, HeliostatStateRow
 from service.twin.alarms.field_updates import FieldStateWriter
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import (
     ORIGIN,

@@ -11,9 +11,9 @@ from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
 from service.sources.folder import read_folder
-from service.twin.runtime.runtime import Runtime
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from service.twin.surfaces.prediction import predict_surface
-from service.twin.transfer.importing import import_folder
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of
 

@@ -8,14 +8,14 @@ from sqlalchemy import select
 
 from model.sunshape import Pillbox
 from service import store
-from service.base.names import is_text
 from service.base.settings import Settings
+from service.base.validation import is_text
 from service.sources.folder import read_folder
 from service.store import audit
 from service.store.tables import DriftRow
-from service.twin.plant import model_versions
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.importing import import_folder
+from service.twin import model_versions
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from tests.service.conftest import paint_measurement, properties_document, tower_document
 
 

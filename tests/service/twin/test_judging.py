@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.store.surfaces.decisions import Justification
-from service.store.surfaces.surface_versions import NewSurface, Trust
+from service.store.decisions import Justification
+from service.store.surface_versions import NewSurface, Trust
 from service.twin.surfaces.evaluation import (
     MIN_HELD_OUT,
     Evaluation,

@@ -5,8 +5,8 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from service.twin.alarms.light import find_lost_light
-from service.twin.studies.camera_watch import LightReading
+from service.twin.alarms.measured_states import find_lost_light
+from service.twin.studies.cameras import LightReading
 
 FIRST = datetime(2026, 5, 1, 10, tzinfo=UTC)
 SPREAD = 0.1

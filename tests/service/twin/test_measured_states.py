@@ -10,7 +10,7 @@ import pytest
 from model.errors import InvalidInputError
 from model.plant import Heliostat, MirrorOptics
 from service.twin.alarms.measured_states import predicted_pointing_error
-from service.twin.forecasts.aim_sources import has_other_state
+from service.twin.forecasts.aims import has_other_state
 from service.twin.forecasts.mirror_states import (
     AS_DECLARED,
     STATE_COLUMNS,
@@ -22,7 +22,7 @@ from service.twin.forecasts.mirror_states import (
     state_rows,
     with_measured,
 )
-from service.twin.pointing.errors import PointingState
+from service.twin.pointing_errors import PointingState
 
 MEASURED = MirrorStates(
     {"A1": Estimate(0.56, (0.5, 0.61))}, {"A2": Estimate(7.5, (5.0, 12.0))}, default_mrad=0.5

@@ -8,7 +8,7 @@ from service.twin.alarms.alarms import Alarm
 from service.twin.alarms.causes import HeliostatFacts, PhotographFacts, outlier_reasons, rank_causes
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview
 from service.twin.alarms.reasons import Reason
-from service.twin.surfaces.epochs import DayOfOthers
+from service.twin.surfaces.present_shape import DayOfOthers
 
 SURFACE = ActiveSurface(1, 1, "network", None, 0.03)
 NOW = datetime(2026, 6, 1, tzinfo=UTC)

@@ -18,15 +18,15 @@ from heliotwin.folder_pointing import calibrate_folder
 from service import store
 from service.base.settings import Settings
 from service.sources.folder import read_folder
+from service.store import mounts
+from service.store.backup import back_up, images_of, restore
+from service.store.check import inspect_store
 from service.store.database import Database
-from service.store.pointing import mounts
-from service.store.recovery.backup import back_up, images_of, restore
-from service.store.recovery.check import inspect_store
 from service.store.tables import MeasurementRow
-from service.twin.pointing.calibration import StoreMounts, calibrate_store
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.exporting import export_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.calibration import StoreMounts, calibrate_store
+from service.twin.exporting import export_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from tests.service.conftest import QUIET, sun_at
 from tests.service.spots import photographs
 

@@ -5,8 +5,7 @@ import threading
 import pytest
 
 from service.base.errors import BusyError
-from service.base.fair_queue import as_caller
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.slots import ComputeSlots, as_caller
 from tests.service.conftest import until
 from tests.waiting import WAIT_LIMIT_S
 

@@ -32,11 +32,11 @@ from service.base.settings import Settings
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.database import Database
-from service.store.photographs.image_files import ImageStore
-from service.store.surfaces.surface_versions import NewSurface
+from service.store.image_files import ImageStore
+from service.store.surface_versions import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
-from service.twin.runtime.runtime import Operations, Runtime
-from service.twin.runtime.slots import ComputeSlots
+from service.twin.runtime import Operations, Runtime
+from service.twin.slots import ComputeSlots
 from service.twin.studies.study import StudyIn, load_study_inputs, study_store
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of, until

@@ -22,9 +22,9 @@ from service.jobs.worker import Worker
 from service.store import audit, keys
 from service.store.database import Database
 from service.store.job_tables import AuditRow
-from service.store.plant.model_versions import put_declared
+from service.store.model_versions import put_declared
 from service.store.tables import MODEL_VERSION
-from service.twin.plant import model_versions
+from service.twin import model_versions
 from tests.service.command import exit_code
 from tests.service.conftest import ORIGIN, FakeOperations, Post, png
 from tests.service.studies import GAMMA, SLOPE, add, adopt, report_of

@@ -10,7 +10,7 @@ from service import store
 from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store import keys
-from service.store.jobs.queue import add_job
+from service.store.queue import add_job
 from tests.page import Page
 from tests.service.conftest import png, poster, sun_at
 from tests.service.studies import study_row

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from service.web.responses.problem_schema import Problem
+from service.web.responses.openapi import Problem
 
 
 def check(answer: Any, status: int) -> dict[str, Any]:

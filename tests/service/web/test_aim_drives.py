@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from model.frames import sun_direction
 from service.sources.folder import read_folder
 from service.store.columns import now
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from tests.service import real
 from tests.service.sources.plant_folder import write_plant_folder
 

@@ -25,8 +25,8 @@ from service.sources.folder import read_folder
 from service.sources.plant_tables import read_aims
 from service.sources.schema import STORED
 from service.store.columns import now
-from service.twin.plant import setup
-from service.twin.transfer.importing import import_folder
+from service.twin import plant_setup
+from service.twin.importing import import_folder
 from tests.page import Page
 from tests.service import real
 from tests.service.sources.aim_plant import write_aim_plant
@@ -394,7 +394,9 @@ def test_a_change_since_todays_plan_raises_an_alarm_until_a_new_plan(plant: Test
     properties = plant.get(path).json()["properties"]
     properties["position_m"][2] += 0.01
     with real.runtime_of(plant).database.writing() as session:
-        setup.set_heliostat(session, setup.Authorship("tester", "surveyed"), name, properties)
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester", "surveyed"), name, properties
+        )
     (alarm,) = outdated(plant)
     assert f"plan {job['id']} of aims for today on main" in alarm["message"]
     assert f"properties of 1: {name}" in alarm["message"]
@@ -434,7 +436,9 @@ def test_another_limit_takes_the_same_images(plant: TestClient, monkeypatch: pyt
     properties = plant.get(f"/v1/heliostats/{name}").json()["properties"]
     properties["position_m"][2] += 0.01
     with real.runtime_of(plant).database.writing() as session:
-        setup.set_heliostat(session, setup.Authorship("tester", "surveyed"), name, properties)
+        plant_setup.set_heliostat(
+            session, plant_setup.Authorship("tester", "surveyed"), name, properties
+        )
     planned(plant, limit_w_m2=70e3, **body)
     assert len(traces) == 2
 

@@ -11,7 +11,7 @@ from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.twin.alarms.alarms import Alarm
 from service.twin.alarms.common_causes import find_bursts
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,

@@ -21,14 +21,12 @@ from model.ephemeris import sun_angles_at
 from model.times import format_minute
 from service import store
 from service.base.settings import Settings
-from service.store import keys
+from service.store import keys, queue
 from service.store.columns import now
 from service.store.job_tables import AuditRow, JobRow
-from service.store.jobs import queue
 from service.store.tables import DriftRow, HeliostatRow, MeasurementRow
-from service.twin.alarms.counts import AlarmCount
-from service.twin.alarms.reasons import REASONS, Reason
-from service.twin.surfaces.epochs import find_accuracy_fall
+from service.twin.alarms.reasons import REASONS, AlarmCount, Reason
+from service.twin.surfaces.present_shape import find_accuracy_fall
 from service.web.app import create_app
 from tests.service.conftest import (
     ORIGIN,

@@ -15,10 +15,10 @@ import pytest
 from fastapi import FastAPI, HTTPException
 from fastapi.testclient import TestClient
 
-from service.base import validation_messages
+from service.base import validation
 from service.base.settings import Settings
 from service.web.app import create_app
-from service.web.auth.bodies import MAX_DEPTH, MAX_KEYS, JsonShape
+from service.web.auth.request_checks import MAX_DEPTH, MAX_KEYS, JsonShape
 from service.web.responses import problems
 from tests.service.access import bearer, make_key
 from tests.service.conftest import (
@@ -98,7 +98,7 @@ def test_document_of_many_faults_costs_no_more_than_one_of_few(
 
     def counting(entry: Any) -> str:
         entries.append(entry)
-        return validation_messages.message_of(entry)
+        return validation.message_of(entry)
 
     monkeypatch.setattr(problems, "message_of", counting)
     aims: dict[str, Any] = {f"!{number}": ["", ""] for number in range(2_000)}

@@ -8,7 +8,7 @@ import pytest
 
 from service.base.settings import Settings
 from service.store import keys
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import FakeOperations, client_of
 

@@ -8,7 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.store.columns import now
-from service.store.photographs.image_files import digest
+from service.store.image_files import digest
 from service.store.tables import ImageRow
 from tests.service.conftest import FakeOperations, Post, png, sun_at
 

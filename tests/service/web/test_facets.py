@@ -15,7 +15,7 @@ from model.surface import control_points
 from service.drawing.facets import FacetPlaces
 from service.sources.folder import read_folder
 from service.sources.plant_file import read_plant
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from tests.page import Page
 from tests.service import real
 from tests.service.sources.plant_files import write_plant

@@ -19,8 +19,8 @@ from model.plant import Heliostat
 from model.plant_model import PlantModel
 from service.base.errors import ConflictError
 from service.store.tables import StudyRow
-from service.twin.plant.model_versions import get_model, model_if_adopted
-from service.twin.runtime.runtime import Runtime
+from service.twin.model_versions import get_model, model_if_adopted
+from service.twin.runtime import Runtime
 from service.twin.studies.field_change import EffectGains, sample_photographs
 from tests.service.conftest import FakeOperations, png, poster, until
 from tests.service.statements import statements

@@ -14,7 +14,7 @@ from heliotwin.field import FieldRequest, trace_field
 from model.fleet import LOSSES
 from service.sources.folder import read_folder
 from service.sources.plant_file import PlantDescription, read_plant
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from tests.page import Page
 from tests.service import real
 from tests.service.sources.plant_files import RICH, write_plant

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from service import store
 from service.base.settings import Settings
 from service.store.database import Database
-from service.store.surfaces.surface_versions import NewSurface, Trust
+from service.store.surface_versions import NewSurface, Trust
 from service.twin.alarms import field_overview
 from service.twin.alarms.field_filter import HeliostatFilter, filter_heliostats
 from service.twin.alarms.field_overview import (
@@ -24,7 +24,7 @@ from service.twin.alarms.field_overview import (
     FieldTotals,
     HeliostatOverview,
 )
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.twin.surfaces.accuracy import Rank
 from service.web.app import create_app
 from service.web.resources.field import FieldView

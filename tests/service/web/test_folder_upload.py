@@ -18,11 +18,11 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL, func, select
 
-from service.base.file_locks import file_lock
+from service.base.processes import file_lock
 from service.base.settings import Settings
 from service.jobs import uploads
 from service.jobs.uploads import delete_unused_uploads
-from service.sources import archive
+from service.sources import files
 from service.store.job_tables import AuditRow, JobRow
 from service.web.app import create_app
 from tests.page import Page
@@ -138,7 +138,7 @@ def test_limits_of_size_and_entries(
         413,
         True,
     )
-    monkeypatch.setattr(archive, "MAX_ENTRIES", 7)
+    monkeypatch.setattr(files, "MAX_ENTRIES", 7)
     assert "file: more than 7 entries" in _upload(client, zipped(folder)).text
     assert _upload(client, bytes(2 * 2**20), UPLOADS).status_code == 413
     assert client.post(UPLOADS, json={}).status_code == 415
@@ -309,7 +309,7 @@ import sys, time
 from pathlib import Path
 from service.base.settings import Settings
 from service.jobs import uploads
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 uploads._count = lambda *_: print("unpacked", flush=True) or time.sleep(600)
 runtime = Runtime.from_settings(Settings(data_dir=Path(sys.argv[1])), object())
 uploads.receive_upload(runtime, open(sys.argv[2], "rb"), "plant.zip", "tester")

@@ -8,7 +8,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.store.plant.model_versions import put_declared
+from service.store.model_versions import put_declared
 from tests.service.conftest import FakeOperations, Post
 
 SUN = {"azimuth_deg": 180.0, "elevation_deg": 30.0}

@@ -9,8 +9,7 @@ from pydantic import BaseModel
 
 from service.base.errors import NotAcceptableError
 from service.web.responses.formats import ARRAYS, JSON, choose, json_answer
-from service.web.responses.representations.npz import NPZ, NPZ_VENDOR
-from service.web.responses.representations.png import PNG
+from service.web.responses.representations import NPZ, NPZ_VENDOR, PNG
 
 
 @pytest.mark.parametrize(

@@ -18,17 +18,13 @@ from fastapi.testclient import TestClient
 from starlette.types import Message, Receive, Scope, Send
 
 from service.base.errors import BusyError
-from service.base.fair_queue import CALLER
 from service.base.settings import Settings
-from service.twin.runtime.runtime import Runtime
-from service.twin.runtime.slots import ComputeSlots
-from service.web.app import create_app
-from service.web.auth.bodies import BodyLimiter
-from service.web.auth.connections import Protocol, protocol_of
-from service.web.auth.fair_limiter import FairLimiter
-from service.web.auth.rate_limiter import RateLimiter, sender_of
+from service.twin.runtime import Runtime
+from service.twin.slots import CALLER, ComputeSlots
+from service.web.app import config_of, create_app
+from service.web.auth.limiters import FairLimiter, Protocol, RateLimiter, protocol_of, sender_of
+from service.web.auth.request_checks import BodyLimiter
 from service.web.middleware import BodyLimitMiddleware
-from service.web.server import config_of
 from tests.service.access import bearer, make_key
 from tests.service.conftest import QUIET, FakeOperations, Post, client_of, png, serving, until
 from tests.waiting import WAIT_LIMIT_S
@@ -356,7 +352,7 @@ def _ask(connection: socket.socket) -> bytes:
 def test_one_address_cannot_hold_all_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Silent connections beyond its share are ended; who comes from elsewhere notices nothing."""
     monkeypatch.setattr(
-        "service.web.auth.connections.is_loopback", lambda address: address == "127.0.0.9"
+        "service.web.auth.limiters.is_loopback", lambda address: address == "127.0.0.9"
     )
     settings = Settings(
         data_dir=tmp_path, max_connections_each=3, forwarded_allow_ips="127.0.0.7", **QUIET

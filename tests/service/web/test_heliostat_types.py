@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.folder import read_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from tests.service import real
 from tests.service.sources.plant_files import RICH, write_plant
 

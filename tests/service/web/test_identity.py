@@ -13,9 +13,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy import URL
 
 from service.base.settings import Settings
-from service.store.photographs.image_files import digest
-from service.store.recovery.check import inspect_store
-from service.twin.runtime.runtime import Runtime
+from service.store.check import inspect_store
+from service.store.image_files import digest
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,

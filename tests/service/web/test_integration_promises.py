@@ -19,9 +19,9 @@ from service.base.settings import Settings
 from service.sources.folder import read_folder
 from service.store.columns import now
 from service.store.tables import DriftRow
-from service.twin.runtime.runtime import Runtime
-from service.twin.transfer.exporting import export_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.exporting import export_folder
+from service.twin.importing import import_folder
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.access import bearer, make_key
 from tests.service.conftest import (

@@ -27,13 +27,12 @@ from service.base.settings import Settings
 from service.jobs.kind import Context
 from service.jobs.kinds import KINDS
 from service.jobs.kinds.predictions import PredictionsIn, predict_many
-from service.store import keys
+from service.store import keys, queue
 from service.store.columns import now
+from service.store.image_files import digest
 from service.store.job_tables import JobRow
-from service.store.jobs import queue
-from service.store.photographs.image_files import digest
 from service.store.tables import ImageRow
-from service.twin.transfer import importing
+from service.twin import importing
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (

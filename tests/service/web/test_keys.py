@@ -21,7 +21,7 @@ from service.store.database import Database
 from service.store.job_tables import AuditRow, KeyRow, SessionRow
 from service.web.app import create_app
 from service.web.auth import dependencies, security
-from service.web.auth.rate_limiter import RateLimiter
+from service.web.auth.limiters import RateLimiter
 from service.web.auth.security import COOKIE, Role
 from tests.service.access import bearer, make_key, withdraw
 from tests.service.command import exit_code

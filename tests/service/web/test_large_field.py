@@ -10,11 +10,11 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service import store
-from service.base.recent_results import RecentResults
 from service.base.settings import Settings
-from service.store.jobs import queue
-from service.store.pointing.mounts import CalibrationState
-from service.twin.pointing import calibration
+from service.store import queue
+from service.store.mounts import CalibrationState
+from service.twin import calibration
+from service.twin.caches import RecentResults
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (

@@ -16,7 +16,7 @@ from service.twin.alarms.causes import HeliostatFacts, LikelyCause, PhotographFa
 from service.twin.alarms.common_causes import find_bursts
 from service.twin.alarms.field_overview import HeliostatOverview
 from service.twin.alarms.reasons import Reason
-from service.twin.pointing.errors import DriveStep, PointingState
+from service.twin.pointing_errors import DriveStep, PointingState
 from tests.service.conftest import ORIGIN, Post, properties_document
 from tests.service.conftest import png as image
 from tests.service.twin.test_open_causes import PHOTOGRAPHS, SURFACE

@@ -14,8 +14,8 @@ from service.base.settings import Settings
 from service.twin.alarms.field_filter import METRICS
 from service.web.app import create_app
 from service.web.auth import security
-from service.web.pages.login import own_path
 from service.web.responses.pages import ASSETS
+from service.web.root.session import own_path
 from tests.page import Page
 from tests.service.conftest import (
     QUIET,

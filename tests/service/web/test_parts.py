@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.drawing.templates import figure, percent, prefixed
-from service.web.responses.csv_tables import PageTable
+from service.web.responses.lists import PageTable
 from tests.page import Page
 from tests.service.conftest import Post, png
 from tests.service.web.pages import HTML, PATHS, text_of

@@ -26,14 +26,9 @@ from service.sources.decode import decode_image
 from service.store.columns import now
 from service.store.database import Database
 from service.store.listing import Period
-from service.store.photographs.groups import (
-    PhotographFilter,
-    dated_groups,
-    list_groups,
-    undated_groups,
-)
+from service.store.photographs import PhotographFilter, dated_groups, list_groups, undated_groups
 from service.store.tables import TargetRow
-from service.twin.runtime import runtime
+from service.twin import runtime
 from service.web.app import create_app
 from service.web.resources import heliostats
 from service.web.resources import photographs as photograph_list

@@ -16,10 +16,10 @@ from model.fleet import FleetFlux, Losses
 from model.plant import Cylinder, TargetPlane
 from service.jobs.kinds.field_forecasts import FleetIn
 from service.jobs.kinds.plans import PlanIn, aim_on, load_of
+from service.store import queue
 from service.store.columns import now
+from service.store.deletion import prune_jobs, prune_plans
 from service.store.job_tables import JobRow, JobStepRow
-from service.store.jobs import queue
-from service.store.record_retention import prune_jobs, prune_plans
 from service.web.resources import plans
 from tests.page import Page
 from tests.service.conftest import FakeOperations

@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 
 from model.surface import control_points
 from service.sources.folder import read_folder
-from service.twin.transfer.importing import import_folder
+from service.twin.importing import import_folder
 from tests.page import Page
 from tests.service import real
 from tests.service.sources.plant_folder import write_plant_folder

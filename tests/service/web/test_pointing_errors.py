@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
-from service.twin.pointing.errors import DriveStep
+from service.twin.pointing_errors import DriveStep
 from tests.page import Page
 from tests.service.conftest import QUIET, Post, png, until
 from tests.service.spots import calibrate, photographs

@@ -15,8 +15,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.base.settings import Settings
-from service.web.app import create_app
-from service.web.server import config_of
+from service.web.app import config_of, create_app
 from tests.service.access import bearer, make_key
 from tests.service.conftest import FakeOperations, free_port, listening, serving
 

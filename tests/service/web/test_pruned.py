@@ -16,7 +16,7 @@ from service.jobs.kinds import KINDS
 from service.jobs.worker import Worker
 from service.store.columns import now
 from service.store.tables import ImageRow
-from service.twin.runtime.runtime import Runtime
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.page import Page
 from tests.service.conftest import (

@@ -22,7 +22,7 @@ from model.study.outcome import Found
 from model.study.parameters import ParameterVector, Term
 from service import store
 from service.base.settings import FIGURE_SCALES
-from service.twin.plant import model_versions
+from service.twin import model_versions
 from service.twin.studies.study import StoredStudy, StudyIn, StudyInputs, row_of_report, study_row
 from tests.model.scenes import photographs
 from tests.page import Page

@@ -101,7 +101,7 @@ def test_part_of_an_unknown_type_is_refused_not_dropped(
 
 
 def test_places_on_panels_are_counted_along_them():
-    from service.base.receivers import receiver_from_json
+    from service.base.plant import receiver_from_json
     from service.jobs.kinds.plans import aim_on
 
     panels = [{"up": [0, 0, 1], **panel} for panel in PANELS]

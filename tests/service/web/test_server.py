@@ -19,7 +19,7 @@ from tests.service.conftest import free_port, metadata, png, properties_document
 from tests.waiting import WAIT_LIMIT_S, child_process, until
 
 _SERVE = (
-    "from service.web.server import serve; from service.base.settings import Settings;"
+    "from service.web.app import serve; from service.base.settings import Settings;"
     " serve(Settings())"
 )
 
@@ -74,8 +74,8 @@ def test_migrate_makes_the_embedded_store(tmp_path: Path):
 _SLOW = """
 import os
 from service.base.settings import Settings
-from service.twin.runtime import runtime, slots
-from service.web.server import serve
+from service.twin import runtime, slots
+from service.web.app import serve
 from tests.service.conftest import FakeOperations
 
 class Slow(FakeOperations):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from service.web.responses.csv_tables import cell
+from service.web.responses.lists import cell
 from tests.service.conftest import Post, png
 from tests.service.web.pages import HTML, fill, settled
 

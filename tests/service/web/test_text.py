@@ -15,10 +15,10 @@ from pydantic import TypeAdapter
 from sqlalchemy import URL
 
 from model.errors import InvalidInputError
-from service.base.names import require_text
 from service.base.settings import Settings
+from service.base.validation import require_text
 from service.sources.documents import read_json
-from service.twin.transfer import history
+from service.twin import history
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,

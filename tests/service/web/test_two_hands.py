@@ -25,7 +25,7 @@ ROOT = Path(service.__file__).parents[1]
 PARALLEL = {
     "heliotwin/cli/demo.py": "a new study",
     "service/twin/forecasts/heliostat_forecast.py": "new forecasts",
-    "service/twin/photographs/deletion.py": "files of deleted photographs",
+    "service/twin/photographs/stored_photograph.py": "files of deleted photographs",
     "service/twin/photographs/ingest.py": "new photographs, which lock their heliostat",
     "service/twin/photographs/repeats.py": "the entry of a forced photograph",
     "service/twin/surfaces/prediction.py": "new surfaces, which lock their heliostat",

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.base import validation_messages
+from service.base import validation
 from service.drawing.templates import model_in_words
 from service.web.responses import problems
 from tests.service.conftest import metadata, png
@@ -25,7 +25,7 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
     def spying(entry: Any) -> str:
         met.add(entry["type"])
-        return validation_messages.message_of(entry)
+        return validation.message_of(entry)
 
     monkeypatch.setattr(problems, "message_of", spying)
     return met

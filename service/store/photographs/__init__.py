@@ -1,1 +1,0 @@
-"""Storage of measurements and their image files."""

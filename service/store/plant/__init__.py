@@ -1,1 +1,0 @@
-"""Storage of the plant: geometry, versions of its model, removal."""

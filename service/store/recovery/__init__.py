@@ -1,1 +1,0 @@
-"""Back-ups, and integrity checks of the store."""

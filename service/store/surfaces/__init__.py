@@ -1,1 +1,0 @@
-"""Storage of surface versions, and decisions which one is active."""

@@ -1,1 +1,0 @@
-"""One heliostat: its mount, its accepted measurements and their metadata."""

@@ -1,1 +1,0 @@
-"""The plant's geometry and the versions of its model."""

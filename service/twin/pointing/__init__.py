@@ -1,1 +1,0 @@
-"""Calibrated mounts and pointing errors."""

@@ -1,1 +1,0 @@
-"""Import and export of measurement folders with their history."""

@@ -1,1 +1,0 @@
-"""Representations of maps other than JSON, one module each with its `REPRESENTATION`."""
