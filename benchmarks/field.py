@@ -11,10 +11,11 @@ import argparse
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from unittest import mock
 from zlib import crc32
 
 import numpy as np
@@ -31,7 +32,7 @@ from service.store.database import Database
 from service.store.tables import HeliostatRow, ImageRow, MeasurementRow, SurfaceRow
 from service.twin.alarms import field_overview
 from service.twin.runtime import Runtime
-from service.twin.surfaces.accuracy import Rank
+from service.twin.surfaces.accuracy import AccuracySeries, Rank
 from service.web.app import create_app
 from tests.faults.harness import new_store
 from tests.service.conftest import (
@@ -162,8 +163,9 @@ def _surface(rng: np.random.Generator, number: int, version: int, at: Any) -> di
     }
 
 
-def _drawn_rank(_: Runtime, heliostat: str) -> Rank:
-    return Rank(0.8 + 0.2 * (crc32(heliostat.encode()) % 1000) / 1000, 3)
+def _drawn_series(_: Runtime, heliostat: str, known: Mapping[str, float]) -> AccuracySeries:
+    accuracy = 0.8 + 0.2 * (crc32(heliostat.encode()) % 1000) / 1000
+    return AccuracySeries(Rank(accuracy, 3), None, dict(known))
 
 
 def _timed(client: TestClient, path: str) -> tuple[float, Any]:
@@ -217,8 +219,12 @@ def main() -> None:
     parser.add_argument("--database", choices=("sqlite", "postgres"), default="sqlite")
     parser.add_argument("--heliostats", type=int, default=20_000)
     options = parser.parse_args()
-    field_overview.rank_of_active = _drawn_rank
-    with tempfile.TemporaryDirectory() as folder, new_store(options.database, Path(folder)) as made:
+    drawn = mock.patch.object(field_overview, "accuracy_series", _drawn_series)
+    with (
+        drawn,
+        tempfile.TemporaryDirectory() as folder,
+        new_store(options.database, Path(folder)) as made,
+    ):
         settings = made.settings.model_copy(update=QUIET | {"job_workers": 1})
         database = Database(settings.database)
         database.upgrade()

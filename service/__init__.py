@@ -1,4 +1,4 @@
-"""The service: seven packages. base, drawing <- sources, store <- twin <- jobs <- web <- cli."""
+"""The service: seven packages. base, drawing <- sources, store <- twin <- jobs <- web."""
 
 import os
 

@@ -14,6 +14,7 @@ pruned.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from model.images import FLUX_SIZE
 from model.metrics import flux_accuracies
 from model.study.flux_images import noise_floor
-from model.study.judging import Gain, few_gain, paired_gain
+from model.study.judging import Gain, clustered_gain, few_gain, paired_gain
 from model.study.parameters import Term
 from model.study.position import EXPECTED, NAT, loss
 from model.study.scope_search import ScopeSearch
@@ -101,28 +102,34 @@ class ForwardSelection:
         judged by the images of the first fit: each image judges a fit that did not see it. An
         effect at one heliostat, or with an end, is judged by held-out images alone, since the
         others chose that heliostat or span among many; they judge several choices. An effect by day
-        is judged on the days that have a fitted image.
+        is judged on the days that have a fitted image. One with values for each heliostat must gain
+        at several, or it is that of a single one.
         """
         if self.scopes.has_full_scope(term):
             return self.gain(after, before, with_position)
         rows = self.fitter.split.held_out
         judging = np.isin(rows, self.fitter.touched(rows, [term]))
-        held_out = _score_changes(
+        held_out = _ScoreChanges.of(
             self.fitter.measured[judging],
             _forecasts(before, judging),
             _forecasts(after, judging),
+            self.heliostats[judging],
             with_position,
         )
         if term.is_permanent or term.until is not None:
-            return few_gain(held_out, among=MAX_SCREENED)
-        if with_position and not held_out.sum() > 0:
-            return few_gain(held_out)
-        return few_gain(
-            np.concatenate([held_out, self._cross_fitted(term, after, before, with_position)])
-        )
+            return few_gain(held_out.changes, among=MAX_SCREENED)
+        if with_position and not held_out.changes.sum() > 0:
+            return few_gain(held_out.changes)
+        both = [held_out, *self._cross_fitted(term, after, before, with_position)]
+        changes, names = (np.concatenate(parts) for parts in zip(*both, strict=True))
+        if not term.is_per_heliostat or not len(changes):
+            return few_gain(changes)
+        return clustered_gain([changes[names == name] for name in np.unique(names)])
 
-    def _cross_fitted(self, term: Term, after: Trial, before: Trial, with_position: bool) -> Array:
-        """Changes of score (n,) of the fitted images, by a fit to the held-out ones."""
+    def _cross_fitted(
+        self, term: Term, after: Trial, before: Trial, with_position: bool
+    ) -> "list[_ScoreChanges]":
+        """Changes of the fitted images, by a fit to the held-out ones; none without images."""
         fitter = self.fitter
         crossed = replace(after, values=before.parameters.transfer(before.values, after.parameters))
         moving = fitter.unknowns.of_terms([term])
@@ -131,13 +138,14 @@ class ForwardSelection:
         )
         rows = fitter.touched(fitter.split.fitted, [term])
         if not len(rows):
-            return np.empty(0)
+            return []
         judge = fitter.forecasters(rows).fine
         first, second = (
             _Forecasts(judge.cuts(trial.effects), judge.position_residuals(trial.effects))
             for trial in (before, crossed)
         )
-        return _score_changes(judge.measured(FLUX_SIZE), first, second, with_position)
+        measured, names = judge.measured(FLUX_SIZE), fitter.heliostats[rows]
+        return [_ScoreChanges.of(measured, first, second, names, with_position)]
 
     def is_worthwhile(self, term: Term, gain: Gain) -> bool:
         """Whether a gain by an effect is significant and large enough."""
@@ -222,20 +230,33 @@ def _forecasts(trial: Trial, judging: NDArray[np.bool_]) -> _Forecasts:
     return _Forecasts(trial.cuts[judging], trial.position_residuals[judging])
 
 
-def _score_changes(
-    measured: Array, before: _Forecasts, after: _Forecasts, with_position: bool
-) -> Array:
-    """Changes of score (n,) of the images whose forecasts differ."""
-    moved = np.nan_to_num(
-        np.linalg.norm(after.position_residuals - before.position_residuals, axis=-1)
-    )
-    differ = (1 - flux_accuracies(before.cuts, after.cuts) > MIN_CHANGE) | (moved > MIN_MOVEMENT)
-    first, second = (
-        flux_accuracies(measured, forecasts.cuts)
-        - with_position * NAT * loss(forecasts.position_residuals)
-        for forecasts in (before, after)
-    )
-    return np.asarray((second - first)[differ])
+class _ScoreChanges(NamedTuple):
+    """Changes of score (n,) of the images whose forecasts differ, and their heliostats (n,)."""
+
+    changes: Array
+    heliostats: NDArray[np.str_]
+
+    @classmethod
+    def of(
+        cls,
+        measured: Array,
+        before: _Forecasts,
+        after: _Forecasts,
+        heliostats: NDArray[np.str_],
+        with_position: bool,
+    ) -> "_ScoreChanges":
+        """Compare forecasts of all images (m, 64, 64) that were ``measured``."""
+        moved = np.nan_to_num(
+            np.linalg.norm(after.position_residuals - before.position_residuals, axis=-1)
+        )
+        unlike = 1 - flux_accuracies(before.cuts, after.cuts) > MIN_CHANGE
+        differ = unlike | (moved > MIN_MOVEMENT)
+        first, second = (
+            flux_accuracies(measured, forecasts.cuts)
+            - with_position * NAT * loss(forecasts.position_residuals)
+            for forecasts in (before, after)
+        )
+        return cls((second - first)[differ], heliostats[differ])
 
 
 def _complexity(term: Term, trial: Trial) -> int:
