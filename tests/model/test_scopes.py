@@ -359,6 +359,16 @@ def test_changed_camera_is_found_with_its_date():
 
 
 @pytest.mark.full
+def test_a_changed_camera_beside_haze_is_found_since_its_day():
+    """A camera of each day would absorb the haze, too."""
+    haze = SunShapeEffect(0.15, scope=Since(date(2024, 6, 18), until=date(2024, 6, 21)))
+    changed = [CameraResponse(1.2, scope=Since(CHANGE)), haze]
+    found = study_to_json(found_in(changed, "camera_response", "sun_shape"))["effects"]
+    scopes = {effect["name"]: effect["scope"] for effect in found}
+    assert scopes["camera_response"]["since"] == "2024-06-16"
+
+
+@pytest.mark.full
 def test_haze_of_a_week_is_found_with_begin_and_end():
     """Photographs of each third day; the haze acts on three of their days."""
     week = Since(date(2024, 6, 8), until=date(2024, 6, 15))

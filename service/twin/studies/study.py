@@ -29,7 +29,13 @@ from service.base.progress import NamedSteps, Report, no_report
 from service.base.validation import format_validation_error
 from service.drawing.study_report import study_body
 from service.store.columns import now
-from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
+from service.store.tables import (
+    UNLIKE_HELIOSTAT,
+    HeliostatRow,
+    MeasurementRow,
+    StudyRow,
+    SurfaceRow,
+)
 from service.twin import model_versions
 from service.twin.measurements import (
     HeliostatContext,
@@ -189,20 +195,29 @@ def extent_of(session: Session, request: StudyIn) -> StudyExtent:
     NotFoundError
         If a named heliostat is not stored.
     """
-    photographs, skipped = {}, {}
+    photographs, skipped = dict[str, int](), dict[str, str]()
     for row in _chosen_heliostats(session, request):
         try:
             _surface(session, row, request.surfaces)
-            photographs[row.name] = len(_chosen_measurements(session, row, request))
+            photographs[row.name] = len(_chosen_measurements(session, row, request, skipped))
         except SKIPPED as error:
             skipped[row.name] = str(error)
     return StudyExtent(photographs, skipped)
 
 
 def _chosen_measurements(
-    session: Session, row: HeliostatRow, request: StudyIn
+    session: Session, row: HeliostatRow, request: StudyIn, skipped: dict[str, str]
 ) -> list[MeasurementRow]:
-    return choose_measurements(session, row, request.images, request.since, request.until)
+    """Photographs of a heliostat, without those that are ``skipped`` as another's."""
+    found = choose_measurements(session, row, request.images, request.since, request.until)
+    unlike = {
+        one.identifier: str(warning["detail"])
+        for one in found
+        for warning in one.warnings or ()
+        if warning["type"] == UNLIKE_HELIOSTAT
+    }
+    skipped |= {f"{row.name}/{name}": detail for name, detail in unlike.items()}
+    return [one for one in found if one.identifier not in unlike]
 
 
 def _chosen_heliostats(session: Session, request: StudyIn) -> Sequence[HeliostatRow]:
@@ -244,7 +259,8 @@ def _load_heliostat_inputs(
     surface = _surface(session, row, request.surfaces)
     points = control_points(twin.heliostat, heights_of(surface))
     seen = {m.identifier for m in surface.measurements}
-    names = [found.identifier for found in _chosen_measurements(session, row, request)]
+    chosen = _chosen_measurements(session, row, request, material.skipped)
+    names = [found.identifier for found in chosen]
     rows = store.get_measurements(session, row, names, arrays=True)
     add_photographs(session, material, twin, rows, points, seen=seen)
 

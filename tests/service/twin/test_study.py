@@ -37,7 +37,7 @@ from service.store.surface_versions import NewSurface
 from service.store.tables import ImageRow, MeasurementRow, SurfaceRow
 from service.twin.runtime import Operations, Runtime
 from service.twin.slots import ComputeSlots
-from service.twin.studies.study import StudyIn, load_study_inputs, study_store
+from service.twin.studies.study import StudyIn, extent_of, load_study_inputs, study_store
 from service.web.app import create_app
 from tests.service.conftest import QUIET, client_of, until
 from tests.service.twin.fields import heights
@@ -322,6 +322,21 @@ def test_measured_surface_goes_before_a_newer_prediction(store_url: URL):
     depth = {p.heliostat: np.ptp(p.setup.control_points[0, :, :, 2]) for p in both.photographs}
     flat_depth = np.ptp(control_points(both.photographs[-1].setup.heliostat)[0, :, :, 2])
     assert depth["AK08"] == pytest.approx(flat_depth)
+    database.close()
+
+
+def test_photograph_of_another_heliostat_is_left_out_by_name(store_url: URL):
+    database = Database(store_url)
+    fill(database)
+    with database.writing() as session:
+        (row,) = store.get_measurements(session, store.get_heliostat(session, "AB12"), ["AB121"])
+        row.warnings = [{"type": "unlike_heliostat", "detail": "unlike AB12, like AK08"}]
+    with database.reading() as session:
+        material = load_study_inputs(session, StudyIn())
+        extent = extent_of(session, StudyIn())
+    assert material.skipped == extent.skipped == {"AB12/AB121": "unlike AB12, like AK08"}
+    assert "AB12/AB121" not in {p.key for p in material.photographs}
+    assert extent.n_photographs == len(material.photographs)
     database.close()
 
 
