@@ -18,9 +18,11 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import fmean as mean
 from typing import Any, NamedTuple
@@ -321,7 +323,6 @@ def run_shift(
             name, offer = left[0]
             done.add(str(left[0]))
             sent(client, offer["method"], offer["path"], offer["body"])
-            print(f"{datetime.now():%H:%M:%S}", name, offer["label"], flush=True)
             work(runtime)
         some = [one for one in photographs if name is None or one.mirror.name == name]
         after = before | judge(store, unseen, some)
@@ -330,7 +331,8 @@ def run_shift(
         label = f"{name or 'plant'}: {offer['label']}"
         worst = min(change, gains[name]) if name in gains else change
         changes.append(Action(label, gains.get(name or "", change), worst))
-        print(f"{100 * changes[-1].gain:+.2f} points", flush=True)
+        done_at = f"{datetime.now():%H:%M:%S} {store.parent.name}"
+        print(f"{done_at} {100 * changes[-1].gain:+.2f} points  {label}", flush=True)
         before = after
     return changes, before
 
@@ -425,6 +427,11 @@ class Result:
     gains: list[float] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
 
+    def add(self, other: "Result") -> None:
+        """Add what other fields of the strength show."""
+        for one in fields(self):
+            getattr(self, one.name).extend(getattr(other, one.name))
+
     def log(self, word: str) -> None:
         """Log the row of a strength."""
         bad = [one for one in self.actions if one.worst < -WORSE]
@@ -444,10 +451,13 @@ class Result:
         log_row("A robot takes what alarms offer", word, cells, n=len(self.gains), of="fields")
 
 
-def try_field(
-    result: Result, root: Path, options: argparse.Namespace, seed: int, word: str
-) -> None:
-    """Let the robot act on a field, and add what it shows to the result."""
+def try_field(options: argparse.Namespace, seed: int, word: str) -> Result:
+    """What the robot shows on a field."""
+    with tempfile.TemporaryDirectory(prefix=f"{word}-{seed}-") as folder:
+        return _try_field(Path(folder), options, seed, word)
+
+
+def _try_field(root: Path, options: argparse.Namespace, seed: int, word: str) -> Result:
     strength = {"strong": 0, "weak": 1, "none": None}[word]
     size = (seed, strength, options.heliostats, options.each)
     case = make_case(root / "plant", *size)
@@ -458,7 +468,7 @@ def try_field(
     write(root / "unseen", case, later)
     begun = judge(root / "store", root / "unseen", later)
     with service_on(root / "store") as (client, _):
-        result.dates += dates(client, case)
+        dated = dates(client, case)
     until_s = time.monotonic() + 60 * options.minutes
     made, ended = run_shift(root / "store", root / "unseen", later, options.most, until_s)
     with service_on(root / "store") as (client, _):
@@ -469,10 +479,9 @@ def try_field(
     ideal = make_case(root / "ideal", *size, oracle=True)
     fill(root / "ideal", root / "oracle", ideal, oracle=True)
     best = judge(root / "oracle", root / "unseen", later)
-    result.rights += found
-    result.actions += made
-    result.gains.append(mean(ended.values()) - mean(begun.values()))
-    result.gaps.append(mean(best.values()) - mean(ended.values()))
+    gain = mean(ended.values()) - mean(begun.values())
+    gap = mean(best.values()) - mean(ended.values())
+    return Result(made, found, dated, [gain], [gap])
 
 
 def main() -> None:
@@ -483,17 +492,23 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=24, help="photographs of a heliostat")
     parser.add_argument("--most", type=int, default=60, help="actions of a field")
     parser.add_argument("--minutes", type=float, default=60, help="time of a field's actions")
+    parser.add_argument("--jobs", type=int, default=1, help="fields at a time")
     parser.add_argument("--strengths", nargs="+", default=["strong", "weak", "none"])
     options = parser.parse_args()
-    results = dict[str, Result]()
-    for seed in range(options.first_seed, options.first_seed + options.seeds):
-        for word in options.strengths:
-            result = results.setdefault(word, Result())
-            with tempfile.TemporaryDirectory() as folder:
-                try_field(result, Path(folder), options, seed, word)
+    results = {word: Result() for word in options.strengths}
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        work = {
+            pool.submit(try_field, options, seed, word): word
+            for seed in seeds
+            for word in options.strengths
+        }
+        for done in as_completed(work):
+            results[work[done]].add(done.result())
             with recording("shift"):
-                for done, one in results.items():
-                    one.log(done)
+                for word, result in results.items():
+                    if result.gains:
+                        result.log(word)
     for word, result in results.items():
         for action in result.actions:
             print(f"{word}: {100 * action.gain:+.2f} points  {action.label}")
