@@ -145,7 +145,7 @@ async def _victim(
     base: str, key: str, ask: Any, seconds: float, pause_s: float
 ) -> tuple[list[float], Counter[str]]:
     """Its times [s] and what it was answered."""
-    times, answers, until_s = [], Counter[str](), time.monotonic() + seconds
+    times, answers, until_s = list[float](), Counter[str](), time.monotonic() + seconds
     async with _client(base, key) as http:
         for turn in itertools.count():
             if time.monotonic() > until_s:
@@ -255,11 +255,9 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if not data_folder().is_dir():
         parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
-    limits = (
-        {}
-        if options.unlimited
-        else {"HELIOTWIN_REQUESTS_PER_S": "200", "HELIOTWIN_REQUESTS_BURST": "400"}
-    )
+    limits: dict[str, Any] = {}
+    if not options.unlimited:
+        limits = {"HELIOTWIN_REQUESTS_PER_S": "200", "HELIOTWIN_REQUESTS_BURST": "400"}
     load = Path("/proc/loadavg").read_text().split()[0]
     print(
         f"{options.database}, {options.seconds:.0f} s each, load"

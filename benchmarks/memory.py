@@ -570,7 +570,7 @@ def measure_inputs(parser: argparse.ArgumentParser, options: argparse.Namespace)
         field.fill(database, options.heliostats)
         database.close()
         import_two(store)
-        settings = {
+        settings: dict[str, Any] = {
             "HELIOTWIN_JOB_WORKERS": "1",
             "HELIOTWIN_IMPORT_ROOT": str(root),
             "HELIOTWIN_DATABASE_CONNECTIONS": "",
