@@ -9,6 +9,7 @@ for a lower limit until they do not, which shows the power that is lost.
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -114,7 +115,7 @@ def main() -> None:
         drawn = [lambda one=one: one for one in found.drawn] if row == "twin" else []
         said = plan_uncertainty(plan, drawn)
         moment = plan_uncertainty(judged)
-        cells = {
+        cells: dict[str, Any] = {
             "power, less than said [%]": 100 * (1 - judged.power / plan.power),
             "limit reached in 95 % of draws [%]": 100 * judged.draws().ratio,
             "draws within the limit [%]": 100 * moment.within,

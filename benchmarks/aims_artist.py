@@ -105,7 +105,8 @@ def by_artist(scenario: Path, kernels: Kernels, power: float, limit: float) -> F
     out, listed = scenario.with_suffix(".npz"), scenario.with_suffix(".json")
     listed.write_text(json.dumps(entries))
     script, sun = Path(__file__).with_name("artist_tracer.py"), map(str, sun_direction(*SUN))
-    command = [Path(sys.argv[1]).absolute(), "-P", script, scenario, "main", *sun, out, listed]
+    command: list[str | Path] = [Path(sys.argv[1]).absolute(), "-P", script, scenario, "main"]
+    command += [*sun, out, listed]
     subprocess.run(command, check=True, cwd=scenario.parent)  # where ARTIST writes its log
     with np.load(out) as found:
         names = found["names"].tolist()

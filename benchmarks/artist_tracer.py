@@ -16,6 +16,7 @@ import sys
 import time
 import types
 from pathlib import Path
+from typing import Any
 
 try:
     import torchvision
@@ -57,7 +58,7 @@ def load(path: Path, points: int, rays: int) -> Scenario:
     return scenario
 
 
-def within_limits(group) -> dict[str, bool]:
+def within_limits(group: Any) -> dict[str, bool]:
     """Whether heliostats reach the aim; ARTIST turns others, with the same normal, on their heads.
 
     Ideal motors have angles; those that begin at zero, as steps do, reach no usual angle.
@@ -70,7 +71,9 @@ def within_limits(group) -> dict[str, bool]:
     return dict(zip(group.names, inside.tolist(), strict=True))
 
 
-def traced(scenario: Scenario, group, index: int, sun: list[float], blocked: bool) -> torch.Tensor:
+def traced(
+    scenario: Scenario, group: Any, index: int, sun: list[float], blocked: bool
+) -> torch.Tensor:
     """Images (N, 256, 256) of all heliostats of a group, each aimed at the target's middle."""
     count = group.number_of_heliostats
     mask = torch.ones(count, dtype=torch.int32)
@@ -138,7 +141,7 @@ def flat(plateau: float) -> torch.Tensor:
     return side[:, None] * side[None, :]
 
 
-def aims_of(group, sun: list[float], plane: torch.Tensor, normal: torch.Tensor) -> np.ndarray:
+def aims_of(group: Any, sun: list[float], plane: torch.Tensor, normal: torch.Tensor) -> np.ndarray:
     """Where rays of the sun from the mirrors' middles (N, 3) meet a target."""
     middles = group.active_surface_points.detach()[..., :3].mean(dim=1)
     normals = group.active_surface_normals.detach()[..., :3].mean(dim=1)
@@ -148,7 +151,9 @@ def aims_of(group, sun: list[float], plane: torch.Tensor, normal: torch.Tensor) 
     return (middles + (((plane - middles) @ normal) / (out @ normal))[:, None] * out).numpy()
 
 
-def plans(path: Path, target: str, sun: list[float], asked: list[dict]) -> dict[str, np.ndarray]:
+def plans(
+    path: Path, target: str, sun: list[float], asked: list[dict[str, Any]]
+) -> dict[str, np.ndarray]:
     """Aims of each entry that is asked for."""
     scenario = load(path, AIM_POINTS, AIM_RAYS)
     index = scenario.solar_tower.target_name_to_index[target]
@@ -189,7 +194,7 @@ def plans(path: Path, target: str, sun: list[float], asked: list[dict]) -> dict[
     return {"names": np.array(group.names), "aims": np.array(aims), "seconds": np.array(seconds)}
 
 
-def area_of(group) -> float:
+def area_of(group: Any) -> float:
     """The area [m2] that ARTIST gives to a mirror."""
     width, height = (4 * group.canting[0].norm(dim=1)[0][:2] + 0.02).tolist()
     return width * height
@@ -199,6 +204,7 @@ _, scenario_file, target_name, *direction, output = sys.argv[:7]
 SUN = [float(x) for x in direction]
 if len(sys.argv) > 7:
     entries = json.loads(Path(sys.argv[7]).read_text())
-    np.savez_compressed(output, **plans(Path(scenario_file), target_name, SUN, entries))
+    arrays: dict[str, Any] = plans(Path(scenario_file), target_name, SUN, entries)
 else:
-    np.savez_compressed(output, **images(Path(scenario_file), target_name, SUN))
+    arrays = images(Path(scenario_file), target_name, SUN)
+np.savez_compressed(output, **arrays)

@@ -88,9 +88,10 @@ def measure(work: str) -> Times:
     import service
 
     assert service
+    import numpy as np
     import torch
 
-    from benchmarks.speed import TARGET, np, scene
+    from benchmarks.speed import TARGET, scene
     from model.network.architecture import MAX_IMAGES
     from model.network.predictor import SurfacePredictor
     from model.plant import Heliostat

@@ -163,7 +163,8 @@ def main(arguments: list[str]) -> None:
     ):
         import_two(store)
         add_field(store, options.heliostats)
-        environment = {"HELIOTWIN_JOB_WORKERS": "1", "HELIOTWIN_JOB_LEASE_S": "60"}
+        environment: dict[str, Any] = {"HELIOTWIN_JOB_WORKERS": "1"}
+        environment |= {"HELIOTWIN_JOB_LEASE_S": "60"}
         with (
             Process(store, "serve", module="service", **environment) as service,
             httpx.Client(base_url=service.base, timeout=60) as http,

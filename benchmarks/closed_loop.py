@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +53,7 @@ COMBINATIONS = (
 )
 
 
-def plain(parameters: dict) -> str:
+def plain(parameters: dict[str, Any]) -> str:
     """Parameters of a report's effect in one line; of many the largest."""
     parts = []
     for name, entry in parameters.items():
@@ -74,8 +75,8 @@ def studies(root: Path) -> None:
         " beyond noise |"
     )
     print("| --- | --- | --- | --- | --- | --- |")
-    for folder in sorted((root.parent / "undeclared").glob("set-*")):
-        print(row(folder.name, study_folder(read_folder(folder)).study), flush=True)
+    for path in sorted((root.parent / "undeclared").glob("set-*")):
+        print(row(path.name, study_folder(read_folder(path)).study), flush=True)
     for window in (4.0, 6.0):
         for label, without in (("", ()), (", without `camera_shoulder`", ("camera_shoulder",))):
             print(
@@ -166,9 +167,10 @@ def left_out(photographs: Sequence[FluxImage], kinds: tuple[str, ...], window: f
         effects: list[Effect] = []
         if kinds:
             views = StudyOptions().fit_view, StudyOptions().view
-            fitter = Fitter(
-                *(Forecaster(rest, PlantModel(JUELICH, optics), window, view) for view in views)
+            coarse, fine = (
+                Forecaster(rest, PlantModel(JUELICH, optics), window, view) for view in views
             )
+            fitter = Fitter(coarse, fine)
             effects = unknowns.effects(fitter.fit(unknowns, unknowns.neutral).values)
         judge = Forecaster([photograph], PlantModel(JUELICH, optics), window, StudyOptions().view)
         accuracy[index] = flux_accuracies(judge.measured(), judge.cuts(effects))[0]
@@ -217,7 +219,7 @@ def by_refinement(
     return refine(heliostat, images, JUELICH_MODEL.with_effects(effects)).z
 
 
-METHODS = {"predicted": by_network, "refined": by_refinement}
+METHODS: dict[str, Method] = {"predicted": by_network, "refined": by_refinement}
 
 
 def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
@@ -304,8 +306,8 @@ def simulated_surfaces(root: Path, effects: Sequence[Effect], count: int) -> Non
                 found.setdefault(f"{method} | {label}", []).append(errors)
     for label, own in found.items():
         mean = {key: float(np.mean([errors[key] for errors in own])) for key in own[0]}
-        method, _, model = label.partition(" | ")
-        log_errors(f"{count} held-out surfaces, {method}, {model} the effect", mean, 8)
+        method, _, effect = label.partition(" | ")
+        log_errors(f"{count} held-out surfaces, {method}, {effect} the effect", mean, 8)
         print(f"| {count} held-out surfaces, 8 rendered images each, {label} | {figures(mean)} | |")
 
 

@@ -24,7 +24,7 @@ from model.setup import Setup
 from model.site import Site
 from model.sunshape import Buie
 from model.tracing import Optics
-from service.sources.decode import decode_image
+from service.sources.decode import Pixels, decode_image
 from service.sources.folder import read_folder
 
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -45,8 +45,8 @@ def line_at(flux: NDArray[np.float32], side: str, share: float) -> float:
 
 
 def shortened(
-    plane: TargetPlane, image: NDArray[np.uint8], side: str, at: float
-) -> tuple[TargetPlane, Array]:
+    plane: TargetPlane, image: Pixels, side: str, at: float
+) -> tuple[TargetPlane, Pixels]:
     """The target that ends at a line, and what is left of an image of it."""
     rows, columns = image.shape[:2]
     low, high = (at, 1.0) if side in ("left", "top") else (0.0, at or 1.0)
@@ -110,7 +110,7 @@ def main() -> None:
         side = SIDES[number % len(SIDES)]
         for share in SHARES:
             target, left = shortened(plane, image, side, line_at(whole.flux, side, share))
-            taken = measure(np.ascontiguousarray(left), "cropped", target)
+            taken = measure(left.copy(), "cropped", target)
             if taken.center_of_mass is None:
                 continue
             spot = target.to_enu(taken.center_of_mass)

@@ -6,7 +6,9 @@ photographs.
 
 import argparse
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -17,7 +19,9 @@ from heliotwin.cli.demo import run_demos
 def main(data: Path | None) -> None:
     """Run the demonstration, which prints its table."""
     with tempfile.TemporaryDirectory() as out:
-        report = run_demos(data, None, Path(out) / "demo", Console())
+        report: Mapping[str, Any] = run_demos(
+            data, None, Path(out) / "demo", Console(), has_field=False
+        )
     other = report.get("other_plant", {"heliostats": []})
     for one in [*report["heliostats"], *other["heliostats"]]:
         methods = ("ideal", "network", "refined", "measured")

@@ -36,7 +36,8 @@ def main() -> None:
     slow = seconds(lambda: JSONResponse({"flux": flux.tolist()}), REPEATS)
     fast = seconds(lambda: json_answer(Nothing(), flux=flux), REPEATS)
     same = all(
-        np.array_equal(np.array(json.loads(b)["flux"], np.float32), flux) for b in (before, after)
+        np.array_equal(np.array(json.loads(bytes(b))["flux"], np.float32), flux)
+        for b in (before, after)
     )
     print(
         f"A {SIDE} x {SIDE} float32 map as JSON, median of {REPEATS} (load of the machine:"

@@ -10,6 +10,7 @@ import argparse
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -43,7 +44,7 @@ TOWER_HEIGHT = 40.0
 ROUGH = replace(FacetKind.of_slopes(1.0, 1.0), reach=0.45, alike=0.4)
 """Facets canted wrong by 1 mrad for each axis, with waves of 1.3 mrad."""
 
-FACETS: dict[int, tuple[FacetDesign, ...]] = {
+FACETS: dict[int, Sequence[FacetDesign]] = {
     1: facet_grid(1, 1, 3.0, 3.0, 0.0),
     6: facet_grid(2, 3, 2.0, 2.0, 0.02),
     25: facet_grid(5, 5, 1.22, 1.22, 0.02),

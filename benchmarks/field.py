@@ -192,7 +192,8 @@ def pages(settings: Settings) -> None:
     it is.
     """
     print("| asked | first [s] | then [s] | size [kB] |\n| --- | --- | --- | --- |")
-    with client_of(create_app(settings, FakeOperations())) as client:
+    operations: Any = FakeOperations()  # without studies, which no page here asks for
+    with client_of(create_app(settings, operations)) as client:
         client.headers["Accept"] = "text/html"
         took, answer = _timed(client, "/")
         print(

@@ -236,7 +236,7 @@ def stored_field() -> None:
                 )
         sun = {"azimuth_deg": SUN[0] % 360, "elevation_deg": SUN[1]}
         payload = field_forecasts.FleetForecastIn.model_validate({"target": "plane", "sun": sun})
-        job = enqueue(runtime, field_forecasts.KIND, payload, "bench")
+        job, _ = enqueue(runtime, field_forecasts.KIND, payload, "bench")
         with Meter() as meter:
             Worker(runtime, KINDS, "bench", threading.Event()).work()
         with runtime.database.reading() as session:
@@ -277,7 +277,8 @@ def field_of_200000(part: int) -> None:
         )
         cells = {"processor [s]": meter.cpu, "memory [MiB]": peak_mib()}
         log_row(table, f"{total.heliostats} traced", cells, n=total.heliostats, of="heliostats")
-    slope, start = np.polyfit(*np.array(rates).T, 1)
+    counts, times = zip(*rates, strict=True)
+    slope, start = np.polyfit(counts, times, 1)
     print(
         f"  projected, linear in the number: {(start + slope * 200_000) / 60:.1f} min of CPU for"
         " all 200,000"

@@ -25,12 +25,12 @@ from benchmarks.record import Estimate, log_row, recording
 from model.imaging import Camera, MeasuredFlux, center_of_mass, measure
 from model.imaging.light import LINEAR, Srgb
 from model.plant import Plant, TargetPlane
-from service.sources.decode import decode_image
+from service.sources.decode import Pixels, decode_image
 from service.sources.documents import read_json, read_targets, read_tower_base
 from service.sources.photograph import mark_layouts
 
 TOWER = "WRI1030197-tower-measurements.json"
-Image = NDArray[np.generic]
+Flux = NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class Case:
 
     name: str
     target: str
-    raw: NDArray[np.uint8] | None
-    paint_crop: NDArray[np.uint8]
+    raw: Pixels | None
+    paint_crop: Pixels
     paint_flux: NDArray[np.float64]
     focal_spot: NDArray[np.float64]
     from_raw: MeasuredFlux | None
@@ -66,7 +66,7 @@ def read_case(properties: Path, plant: Plant) -> Case:
     record = json.loads(properties.read_text())
     plane = plant.targets[record["target_name"]]
 
-    def image(kind: str) -> NDArray[np.uint8]:
+    def image(kind: str) -> Pixels:
         return decode_image((properties.parent / f"{stem}-{kind}.png").read_bytes())
 
     raw = image("raw") if (properties.parent / f"{stem}-raw.png").exists() else None
@@ -90,7 +90,7 @@ def read_case(properties: Path, plant: Plant) -> Case:
     )
 
 
-def correlation(ours: NDArray[np.uint8], theirs: NDArray[np.uint8]) -> float:
+def correlation(ours: Pixels, theirs: Pixels) -> float:
     return float(np.corrcoef(ours.ravel().astype(float), theirs.ravel().astype(float))[0, 1])
 
 
@@ -139,9 +139,13 @@ def mark_shift(case: Case) -> float:
     onto the other.
     """
     assert case.from_raw is not None
-    ours = case.from_raw.crop
+    assert case.from_raw.crop is not None
     _, warp = cv2.findTransformECC(
-        ours, case.paint_crop, np.eye(3, dtype=np.float32), cv2.MOTION_HOMOGRAPHY, (3, 300, 1e-6)
+        case.from_raw.crop,
+        case.paint_crop,
+        np.eye(3, dtype=np.float32),
+        cv2.MOTION_HOMOGRAPHY,
+        (3, 300, 1e-6),
     )
     square = np.array([[[-0.5, -0.5], [255.5, -0.5], [-0.5, 255.5], [255.5, 255.5]]])
     moved = cv2.perspectiveTransform(square, np.linalg.inv(warp.astype(np.float64)))
@@ -237,7 +241,7 @@ def measure_folder(folder: Path, plane: TargetPlane) -> Counter[str]:
 
 def composite(
     rng: np.random.Generator, empties: list[Path], fluxes: list[Path], *, foreign: bool
-) -> tuple[Image, Image]:
+) -> tuple[NDArray[np.uint8], Flux]:
     """A real empty target with a real flux somewhere on it, beside a foreign spot of half the size;
     and that flux.
 
@@ -246,9 +250,9 @@ def composite(
     empty = Srgb().light(decode_image(empties[rng.integers(len(empties))].read_bytes()) / 255)
     reflectance = empty / np.median(empty)
 
-    def placed(scale: float) -> Image:
-        flux = decode_image(fluxes[rng.integers(len(fluxes))].read_bytes()).astype(np.float32)
-        flux = cv2.warpAffine(flux, np.array([[scale, 0, 0], [0, scale, 0]]), (256, 256))
+    def placed(scale: float) -> Flux:
+        whole = decode_image(fluxes[rng.integers(len(fluxes))].read_bytes()).astype(np.float32)
+        flux = cv2.warpAffine(whole, np.array([[scale, 0, 0], [0, scale, 0]]), (256, 256))
         rows, columns = np.nonzero(flux > 0.02 * flux.max())
         shift = (
             rng.integers(-columns.min(), 256 - columns.max()),

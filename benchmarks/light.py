@@ -482,7 +482,9 @@ def _best_of_all(case: Case, counts: list[int]) -> list[float]:
             cv2.GaussianBlur(cut, (0, 0), blur * FLUX_SIZE / FLUX_WINDOW) if blur > 1e-3 else cut
         )
         middle = (FLUX_SIZE - 1) / 2
-        moved = cv2.getRotationMatrix2D((middle, middle), float(np.degrees(turn)), 1 + scale)
+        moved = np.asarray(
+            cv2.getRotationMatrix2D((middle, middle), float(np.degrees(turn)), 1 + scale), float
+        )
         moved[:, 2] += np.array([right, down]) * FLUX_SIZE / FLUX_WINDOW
         image = cv2.warpAffine(image, moved, cut.shape, borderMode=cv2.BORDER_REPLICATE)
         image = (image.clip(0) ** (1 + exponent) + ambient).clip(0)

@@ -280,7 +280,7 @@ def main(arguments: list[str]) -> None:
         new_store(options.database, Path(folder)) as store,
     ):
         import_two(store)
-        extra = {
+        extra: dict[str, Any] = {
             "HELIOTWIN_JOB_WORKERS": "1",
             "HELIOTWIN_JOB_LEASE_S": "30",
             "HELIOTWIN_JOB_POLL_S": "0.5",

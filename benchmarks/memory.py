@@ -136,7 +136,8 @@ def tiff() -> bytes:
 
 def png() -> bytes:
     pixels = spot(np.uint16)
-    return cv2.imencode(".png", np.dstack([pixels, pixels[..., :1]]))[1].tobytes()
+    compressed = [cv2.IMWRITE_PNG_COMPRESSION, 6]  # the service accepts files of 32 MiB
+    return cv2.imencode(".png", np.dstack([pixels, pixels[..., :1]]), compressed)[1].tobytes()
 
 
 def jpeg() -> bytes:
@@ -570,7 +571,7 @@ def measure_inputs(parser: argparse.ArgumentParser, options: argparse.Namespace)
         field.fill(database, options.heliostats)
         database.close()
         import_two(store)
-        settings = {
+        settings: dict[str, Any] = {
             "HELIOTWIN_JOB_WORKERS": "1",
             "HELIOTWIN_IMPORT_ROOT": str(root),
             "HELIOTWIN_DATABASE_CONNECTIONS": "",

@@ -184,7 +184,8 @@ def log_accuracies(table: str, row: str, found: dict[str, Array], goal: str | No
 def log_cameras(root: Path) -> None:
     """Print and record accuracies by the command line's own forecasts, as light and as chosen."""
     found: dict[str, dict[str, list[float]]] = {name: {} for name in OF_PAINT}
-    for camera, declared in (("as light", {"cameras": []}), ("camera chosen", None)):
+    as_light: dict[str, object] = {"cameras": []}
+    for camera, declared in (("as light", as_light), ("camera chosen", None)):
         with TemporaryDirectory() as directory:
             folder = read_folder(_linked(root, Path(directory) / "stj", declared), list(OF_PAINT))
             report = forecast_folder(folder, Path(directory) / "out")["measurements"]

@@ -31,6 +31,7 @@ from model.site import JUELICH, Site
 from service.sources.folder import read_folder
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 DEVELOPED_ON = ("BE36", "BF41", "BF55", "BG14", "BG23", "BH20", "BH60", "BJ14")
 
@@ -130,7 +131,7 @@ def errors_mrad(
 
 def covered(plant: Plant, mounts: dict[str, CalibratedMount], judged: Series) -> float:
     """Share of judges within their 90 % ellipse."""
-    inside = []
+    inside: list[bool] = []
     for name, own in judged.items():
         std = standard_deviations(plant, mounts[name], name, own)
         off = 1e3 * pointing_error(plant.heliostats[name], mounts[name], own)
@@ -247,7 +248,7 @@ def forward(plant: Plant) -> None:
     print("| kept | all | not moved | not moved, within 5 days | moved | measurements |")
     print("| --- | --- | --- | --- | --- | --- |")
     for kept in FORWARD_KEPT:
-        inside, moved, apart = list[Array](), list[Array](), list[Array]()
+        inside, moved, apart = list[Flags](), list[Flags](), list[Array]()
         for place in np.linspace(0, 1, FORWARD_PLACES):
             known, judged = {}, {}
             for name, own in plant.readings.items():
@@ -265,7 +266,8 @@ def forward(plant: Plant) -> None:
                 inside.append((errors >= low) & (errors <= high))
                 moved.append(errors > MOVED_STD * standard_deviations(plant, mount, name, own))
                 apart.append(np.array([one.day for one in own]) - known[name][-1].day)
-        held, has_moved, days = (np.concatenate(one) for one in (inside, moved, apart))
+        held, has_moved = np.concatenate(inside), np.concatenate(moved)
+        days = np.concatenate(apart)
         cells = {
             "all [%]": 100 * held.mean(),
             "not moved [%]": Estimate(100 * held[~has_moved].mean(), goal=">= 85"),

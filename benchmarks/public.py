@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from benchmarks.record import log_row, recording
 from service.base.settings import Settings
@@ -69,7 +70,7 @@ async def rates(port: int, data: bytes, seconds: float) -> dict[int, float]:
     return {status: number / (time.monotonic() - began) for status, number in counts.items()}
 
 
-def measure(folder: Path, seconds: float, **environment: str) -> dict[str, dict[int, float]]:
+def measure(folder: Path, seconds: float, **environment: Any) -> dict[str, dict[int, float]]:
     """Answers per second by route and status, of a new service."""
     with Process(Store(folder, None), module="service", **environment) as service:
         found = {}

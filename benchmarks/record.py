@@ -121,7 +121,7 @@ def log_row(
 def recording(name: str) -> Iterator[None]:
     """Write the rows that are logged meanwhile to ``results/NAME.json``, if there are any."""
     record = {"name": name, "command": command(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
-    record |= {"commit": commit(), "machine": machine()}
+    measured = {"commit": commit(), "machine": machine()}
     figures: list[dict[str, Any]] = []
     token = _figures.set(figures)
     try:
@@ -129,7 +129,7 @@ def recording(name: str) -> Iterator[None]:
     finally:
         _figures.reset(token)
     if figures:
-        write(record | {"figures": figures})
+        write({**record, **measured, "figures": figures})
 
 
 def write(record: Mapping[str, Any]) -> None:

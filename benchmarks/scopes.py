@@ -12,6 +12,7 @@ later call does what is missing; ``OUT/scopes.md`` and ``OUT/scopes.png`` show t
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
@@ -180,7 +181,7 @@ def table(records: Sequence[Record]) -> Iterator[str]:
                 by_strength(own, rule, percent) for rule in (named, scoped, whose, dated, right)
             )
             accuracy = " | ".join(
-                by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
+                by_strength(own, itemgetter(key), mean) for key in ("before", "after")
             )
             true = by_strength(own, lambda r: r["true"], mean) if known or name == "calm" else ""
             columns = ("effect", "kind of scope", "heliostat", "date", "all of it")

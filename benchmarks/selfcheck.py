@@ -24,12 +24,13 @@ from model.images import normalized
 from model.metrics import surface_error
 from model.observation import SurfacePrediction, render_observations
 from model.plant_model import JUELICH_MODEL
+from model.prior import tilt_modes
 from service.sources.folder import read_folder
 from service.twin.measurements import choose_diverse
 from service.twin.operations import predict
 from training.cases import Case, make_cases
 from training.render import CleanCamera, load_field
-from training.surfaces import load_part, tilt_modes
+from training.surfaces import load_part
 
 NOISE = 0.01
 """Standard deviation of a pixel, of the peak."""

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ def main() -> None:
                 .sum((1, 2))
             )
             each = (
-                seconds(lambda s=samples: trace(batch, window, samples=s, padding=0.25), 20)
+                seconds(partial(trace, batch, window, samples=samples, padding=0.25), 20)
                 / BATCH
                 * 1e3
             )
@@ -102,14 +103,17 @@ def main() -> None:
     images = observe(mirror, default_prior().mean, setups, CleanCamera(), rng)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    one, two = (
+    single, pair = (
         {n: v.numpy() for n, v in zip(INPUTS, example(batch, MAX_IMAGES), strict=True)}
         for batch in (1, 2)
     )
     # The iterations before the last, which is made for the mirrored world, too.
     taken = (
         seconds(
-            lambda: [predictor.iterate(inputs) for inputs in [one] * (N_ITERATIONS - 1) + [two]], 20
+            lambda: [
+                predictor.iterate(inputs) for inputs in [single] * (N_ITERATIONS - 1) + [pair]
+            ],
+            20,
         )
         * 1e3
     )
@@ -118,8 +122,8 @@ def main() -> None:
     for n_iterations in (1, N_ITERATIONS):
         taken = (
             seconds(
-                lambda n=n_iterations: predictor.heights(
-                    mirror, images, JUELICH_MODEL, n_iterations=n
+                partial(
+                    predictor.heights, mirror, images, JUELICH_MODEL, n_iterations=n_iterations
                 ),
                 20,
             )

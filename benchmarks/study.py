@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from hashlib import sha256
 from multiprocessing import get_context
+from operator import itemgetter
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -135,7 +136,7 @@ def errors(effect: Record, truth: Sequence[Record]) -> Iterator[Record]:
     """For each parameter of a true effect that was found: its relative error, and the share within
     the intervals.
     """
-    true = next((t["parameters"] for t in truth if t["name"] == effect["name"]), {})
+    true: Record = next((t["parameters"] for t in truth if t["name"] == effect["name"]), {})
     for parameter in KINDS[effect["name"]].parameters():
         expected = flat(true.get(parameter.name, parameter.neutral))
         size = np.linalg.norm(expected - parameter.neutral)
@@ -312,7 +313,7 @@ def table(records: Sequence[Record]) -> Iterator[str]:
             )
             shares = " | ".join(by_strength(own, rule, percent) for rule in (first, among))
             accuracy = " | ".join(
-                by_strength(own, lambda r, k=key: r[k], mean) for key in ("before", "after")
+                by_strength(own, itemgetter(key), mean) for key in ("before", "after")
             )
             truth = "" if name in NAMELESS else by_strength(own, lambda r: r["true"], mean)
             cells = dict(

@@ -27,6 +27,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,11 @@ def photographed(
     ]
 
 
+def by_network(heliostat: Heliostat, seen: list[Observation]) -> SurfacePrediction:
+    """What the shipped network predicts."""
+    return default_predictor().predict(heliostat, seen, JUELICH_MODEL)
+
+
 def held(heliostat: Heliostat, z: Array, setups: list[Observation], rays: int) -> list[Observation]:
     """`photographed` in the smallest window that holds the spots, or the largest there is."""
     for side in WINDOWS:
@@ -182,24 +188,19 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         seen = photographed(
             heliostat, fine, places_of(years, IMAGES), rays, np.random.default_rng(1)
         )
-        row(
-            RENDERED,
-            f"{name} network",
-            lambda h=heliostat, o=seen: default_predictor().predict(h, o, JUELICH_MODEL),
-            truth,
-        )
+        row(RENDERED, f"{name} network", partial(by_network, heliostat, seen), truth)
         ends = {
             "refined from the mean": row(
                 RENDERED,
                 f"{name} refined",
-                lambda h=heliostat, o=seen: refine(h, o, JUELICH_MODEL),
+                partial(refine, heliostat, seen, JUELICH_MODEL),
                 truth,
                 "<= 0.07",
             ),
             "from the truth": row(
                 RENDERED,
                 f"{name} refined from the truth",
-                lambda h=heliostat, o=seen, t=truth: refine(h, o, JUELICH_MODEL, t),
+                partial(refine, heliostat, seen, JUELICH_MODEL, truth),
                 truth,
             ),
         }
@@ -208,8 +209,12 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         row(
             RENDERED,
             f"{name} refined without ripples",
-            lambda h=heliostat, o=seen: refine(
-                h, o, JUELICH_MODEL, options=RefinementOptions(with_ripples=False)
+            partial(
+                refine,
+                heliostat,
+                seen,
+                JUELICH_MODEL,
+                options=RefinementOptions(with_ripples=False),
             ),
             truth,
         )
@@ -217,7 +222,7 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         row(
             RENDERED,
             f"{name} refined, generic prior",
-            lambda h=heliostat, o=seen, p=generic: refine(h, o, JUELICH_MODEL, prior=p),
+            partial(refine, heliostat, seen, JUELICH_MODEL, prior=generic),
             truth,
             "<= 0.12",
         )
@@ -226,7 +231,7 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         row(
             RENDERED,
             f"{name} with facets half as large again, refined",
-            lambda h=larger, o=images: refine(h, o, JUELICH_MODEL),
+            partial(refine, larger, images, JUELICH_MODEL),
             shape,
         )
         smooth = photographed(
@@ -235,13 +240,13 @@ def rendered(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> 
         row(
             RENDERED,
             f"{name} of 8 x 8 heights, network",
-            lambda h=heliostat, o=smooth: default_predictor().predict(h, o, JUELICH_MODEL),
+            partial(by_network, heliostat, smooth),
             truth,
         )
         row(
             RENDERED,
             f"{name} of 8 x 8 heights, refined",
-            lambda h=heliostat, o=smooth: refine(h, o, JUELICH_MODEL),
+            partial(refine, heliostat, smooth, JUELICH_MODEL),
             truth,
             "<= 0.07",
         )
@@ -278,16 +283,11 @@ def far(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> None:
                 else (smallest,)
             ):
                 label = f"{name} at {distance:.0f} m, {taken[0].side:g} m"
-                row(
-                    FAR_AWAY,
-                    f"{label}, network",
-                    lambda h=heliostat, o=taken: default_predictor().predict(h, o, JUELICH_MODEL),
-                    truth,
-                )
+                row(FAR_AWAY, f"{label}, network", partial(by_network, heliostat, taken), truth)
                 row(
                     FAR_AWAY,
                     f"{label}, refined",
-                    lambda h=heliostat, o=taken: refine(h, o, JUELICH_MODEL),
+                    partial(refine, heliostat, taken, JUELICH_MODEL),
                     truth,
                 )
 
@@ -301,7 +301,7 @@ def scaling(folder: MeasurementFolder, years: MeasurementFolder, rays: int) -> N
         row(
             "AA39 rendered, by the number of images",
             f"{count} images",
-            lambda n=count: refine(heliostat, seen[:n], JUELICH_MODEL),
+            partial(refine, heliostat, seen[:count], JUELICH_MODEL),
             truth,
         )
 
@@ -329,11 +329,7 @@ def real(years: MeasurementFolder) -> None:
     for name, chosen in sets.items():
         start = default_predictor().predict(heliostat, spread(chosen, 8), JUELICH_MODEL)
         found = row(
-            REAL,
-            name,
-            lambda c=chosen, s=start: refine(heliostat, c, JUELICH_MODEL, s.z),
-            truth,
-            "<= 0.25",
+            REAL, name, partial(refine, heliostat, chosen, JUELICH_MODEL, start.z), truth, "<= 0.25"
         )
         by_surface = {
             "accuracy on other photographs, median": Estimate(accuracy(found.z), n=len(others)),

@@ -84,11 +84,14 @@ def log_folds() -> None:
 
     def table(folds: list[dict[str, Any]]) -> str:
         for row, get in crossvalidate.ROWS.items():
-            values = {name: [get(fold[name]) for fold in folds] for name in folds[0]}
+            values = {
+                name: [v for fold in folds if (v := get(fold[name])) is not None]
+                for name in folds[0]
+            }
             cells = {
                 name: Estimate(np.mean(some), std=float(np.std(some, ddof=1)))
                 for name, some in values.items()
-                if None not in some
+                if len(some) == len(folds)
             }
             title = "Held-out mirrors, mean and standard deviation between folds"
             log_row(title, row, cells, n=len(folds), of="folds", compared_with="the true surfaces")

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,10 +91,10 @@ def halves(taken: Sequence[FluxImage]) -> list[list[FluxImage]]:
 def fitted(taken: Sequence[FluxImage], names: Sequence[str]) -> list[Effect]:
     """Effects that are always there, fitted to photographs together."""
     views = StudyOptions().fit_view, StudyOptions().view
-    pair = [Forecaster(taken, JUELICH_MODEL, WINDOW, view) for view in views]
+    coarse, fine = (Forecaster(taken, JUELICH_MODEL, WINDOW, view) for view in views)
     facets = tuple(sorted({(p.heliostat, len(p.setup.control_points)) for p in taken}))
     unknowns = ParameterVector(tuple(Term(CATALOGUE[name]) for name in names), facets)
-    return unknowns.effects(Fitter(*pair).fit(unknowns, unknowns.neutral).values)
+    return unknowns.effects(Fitter(coarse, fine).fit(unknowns, unknowns.neutral).values)
 
 
 def gains(both: Sequence[Sequence[FluxImage]], label: str, names: Sequence[str]) -> str:
@@ -155,7 +156,7 @@ def moved(until: datetime) -> None:
         f"{conclude(found)}\nfound: {described(found)}; from motors [mrad]:"
         f" {found.position_error_mrad}"
     )
-    cells = {"finds": described(found)}
+    cells: dict[str, Any] = {"finds": described(found)}
     if (error := found.position_error_mrad) is not None:
         cells |= {"spots without [mrad]": error.before, "spots with [mrad]": error.after}
     log_row(
@@ -218,7 +219,8 @@ def of_halves(out: Path | None) -> None:
         " days |"
     )
     print("| --- | --- | --- | --- | --- | --- |")
-    for name, seen, unseen in (("even days", *both), ("odd days", *reversed(both))):
+    even, odd = both
+    for name, seen, unseen in (("even days", even, odd), ("odd days", odd, even)):
         found = study(seen, JUELICH_MODEL, options=asked)
         before, after = accuracies(unseen, []), accuracies(unseen, found.effects)
         low, high = interval(after - before, [day_of(p) for p in unseen])
