@@ -86,21 +86,6 @@ class SheetEdges:
     """No marks: the target is a white rectangle against darker surroundings."""
 
 
-class KnownCamera(Protocol):
-    """A camera that shows a target at known pixels."""
-
-    @property
-    def image_size(self) -> ImageSize | None:
-        """Columns and rows of its photographs; None for any."""
-
-    @property
-    def is_straight(self) -> bool:
-        """Whether it shows straight lines as straight lines."""
-
-    def to_pixels(self, plane: Rectangle, places: ArrayLike, size: ImageSize) -> Array:
-        """Pixels (n, 2) of places (n, 2) [m] of a target, in photographs of ``size``."""
-
-
 def _array(name: str, value: ArrayLike, *shape: int) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
@@ -161,7 +146,7 @@ class CameraHomography:
         object.__setattr__(self, "homography", matrix)
 
     def to_pixels(self, plane: Rectangle, places: ArrayLike, size: ImageSize) -> Array:
-        """As of `KnownCamera`."""
+        """Pixels (n, 2) of places (n, 2) [m] of a target, in photographs of ``size``."""
         inverse = np.asarray(np.linalg.inv(self.homography), dtype=np.float64)
         return project(inverse, np.asarray(places, dtype=np.float64))
 
@@ -191,7 +176,7 @@ class CameraCorners:
         object.__setattr__(self, "corners_px", corners)
 
     def to_pixels(self, plane: Rectangle, places: ArrayLike, size: ImageSize) -> Array:
-        """As of `KnownCamera`."""
+        """Pixels (n, 2) of places (n, 2) [m] of a target, in photographs of ``size``."""
         right, up = np.asarray(places, dtype=np.float64).T
         sides = np.stack([right / plane.width + 0.5, 0.5 - up / plane.height], axis=-1)
         return project(homography_through(UNIT_CORNERS, self.corners_px), sides)
@@ -258,11 +243,11 @@ class CameraPose:
 
     @property
     def is_straight(self) -> bool:
-        """As of `KnownCamera`."""
+        """Whether the lens shows straight lines as straight lines."""
         return not any(self.distortion)
 
     def to_pixels(self, plane: Rectangle, places: ArrayLike, size: ImageSize) -> Array:
-        """As of `KnownCamera`.
+        """Pixels (n, 2) of places (n, 2) [m] of a target, in photographs of ``size``.
 
         Raises
         ------
@@ -306,10 +291,15 @@ class CameraPose:
         )
 
 
-Locator = BracketMarks | SheetEdges | CameraHomography | CameraCorners | CameraPose
-"""A way to locate a target in a photograph."""
+KnownCamera = CameraHomography | CameraCorners | CameraPose
+"""A camera that shows a target at known pixels.
 
-KNOWN_CAMERAS = (CameraHomography, CameraCorners, CameraPose)
+``image_size`` are columns and rows of its photographs, None for any. ``is_straight`` is whether it
+shows straight lines as straight lines.
+"""
+
+Locator = BracketMarks | SheetEdges | KnownCamera
+"""A way to locate a target in a photograph."""
 
 
 def corner_places(plane: Rectangle) -> Array:
@@ -372,7 +362,7 @@ def locator_to_json(locator: Locator) -> dict[str, object]:
     return {"marks": "none", "camera": _camera_to_json(locator) | size}
 
 
-def _camera_to_json(camera: CameraHomography | CameraCorners | CameraPose) -> dict[str, object]:
+def _camera_to_json(camera: KnownCamera) -> dict[str, object]:
     if isinstance(camera, CameraHomography):
         return {"homography": camera.homography.tolist()}
     if isinstance(camera, CameraCorners):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import ImageRefusedError, InvalidInputError, UnreachableError
 from model.frames import enu_to_wgs84, wgs84_to_enu
-from model.locating import KNOWN_CAMERAS, Locator, corners_by_camera, locator_from_json
+from model.locating import KnownCamera, Locator, corners_by_camera, locator_from_json
 from model.mount import Mount
 from model.site import Site
 
@@ -498,7 +498,7 @@ class TargetPlane:
             If a declared camera cannot see it; it begins with the key of the mistake.
         """
         locator = locator_from_json(declared)
-        if isinstance(locator, KNOWN_CAMERAS):
+        if isinstance(locator, KnownCamera):
             try:
                 corners_by_camera(locator, self)
             except ImageRefusedError as refusal:

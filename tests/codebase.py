@@ -131,7 +131,7 @@ def repeated_classes() -> dict[str, list[str]]:
     return {name: found for name, found in places.items() if len(found) > 1}
 
 
-REQUEST_CLASSES = ("ReceiverChoice", "ForecastIn", "Setup")
+REQUEST_CLASSES = ("ForecastBase", "ForecastIn", "Setup")
 """What a forecast request is on its way from the REST schema to the tracer."""
 
 
@@ -230,7 +230,7 @@ def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> 
 
 
 LIMITS = {
-    "lines of code": 54_423,
+    "lines of code": 54_377,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,

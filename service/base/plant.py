@@ -53,8 +53,8 @@ class _ReceiverPart(Model):
     absorptance: Number = ABSORPTANCE
 
     def named(self, name: str) -> AnyReceiver:
-        """Convert to the model's receiver with this name."""
-        return receiver_from_json(name, self.model_dump())
+        """Convert to the model's receiver with this name, which answers have as a field."""
+        return receiver_from_json(name, self.model_dump(exclude={"name"}))
 
 
 class CylinderIn(_ReceiverPart):

@@ -5,9 +5,9 @@ audit entries go in batches, oldest first.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import timedelta
 
+from pydantic import Field
 from sqlalchemy import ColumnElement, delete, func, select
 from sqlalchemy.orm import Session
 
@@ -17,7 +17,7 @@ from service.store.columns import Base
 from service.store.job_tables import AcknowledgementRow, AlarmRow, AuditRow, JobRow
 from service.store.keys import RESERVED
 from service.store.measurements import get_measurement, images_of_photograph
-from service.store.photographs import delete_drift, made_from, note_change
+from service.store.photographs import MadeFrom, delete_drift, made_from, note_change
 from service.store.plant import get_heliostat, get_receiver, get_target
 from service.store.queue import ENDED
 from service.store.rows import lock_heliostat
@@ -39,13 +39,10 @@ from service.store.tables import (
 )
 
 
-@dataclass(frozen=True)
-class Deleted:
-    """Identifiers of deleted images, and the surfaces and number of forecasts based on them."""
+class Deleted(MadeFrom):
+    """A deleted photograph, and what was made from it."""
 
-    images: tuple[str, ...]
-    surfaces: tuple[int, ...]
-    forecasts: int
+    deleted: list[str] = Field(description="Ids of the images that were deleted.")
 
 
 def delete_photograph(
@@ -92,7 +89,7 @@ def delete_photograph(
     session.flush()
     for sha256 in sorted({image.image_sha256 for image in rows if image.image_sha256 is not None}):
         image_files.mark_unused(session, sha256)
-    return Deleted(tuple(image.identifier for image in rows), derived.surfaces, derived.forecasts)
+    return Deleted(**dict(derived), deleted=[image.identifier for image in rows])
 
 
 def _name_in_surfaces(session: Session, rows: Sequence[MeasurementRow]) -> None:

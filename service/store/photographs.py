@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
+from pydantic import BaseModel, Field
 from sqlalchemy import (
     ColumnElement,
     Select,
@@ -245,12 +246,13 @@ def _images(session: Session, found: Sequence[MeasurementRow]) -> dict[int, list
     return images
 
 
-@dataclass(frozen=True)
-class MadeFrom:
+class MadeFrom(BaseModel):
     """Surface versions from a photograph, and the number of forecasts with these surfaces."""
 
-    surfaces: tuple[int, ...]
-    forecasts: int
+    surface_versions: list[int] = Field(
+        description="Versions of the heliostat's surface that were made from it as it was."
+    )
+    forecasts: int = Field(description="How many forecasts were made with those.")
 
 
 def made_from(session: Session, measurement: MeasurementRow) -> MadeFrom:
@@ -261,7 +263,7 @@ def made_from(session: Session, measurement: MeasurementRow) -> MadeFrom:
         select(SurfaceRow.version).where(SurfaceRow.id.in_(of)).order_by(SurfaceRow.version)
     )
     forecasts = select(func.count()).select_from(ForecastRow).where(ForecastRow.surface_id.in_(of))
-    return MadeFrom(tuple(versions), session.scalars(forecasts).one())
+    return MadeFrom(surface_versions=list(versions), forecasts=session.scalars(forecasts).one())
 
 
 def list_corrections(

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from model.fleet import LOSSES, FleetFlux, Losses
 from model.plant import Receiver
 from service import store
-from service.base.fields import AnySun, Flag, ModelVersion, Name, Position, Resolution
+from service.base.fields import AnySun, Flag, Name, Position
 from service.jobs.kind import (
     Context,
     Heliostats,
@@ -35,12 +35,12 @@ from service.twin.forecasts.field_forecast import (
 )
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.forecasts.mirror_states import with_measured
-from service.twin.forecasts.requests import ReceiverChoice, position_of
-from service.twin.forecasts.watts import Sunlight, field_watts, heliostat_watts
+from service.twin.forecasts.requests import ForecastBase, position_of
+from service.twin.forecasts.watts import field_watts, heliostat_watts
 from service.twin.runtime import Runtime
 
 
-class FleetIn(ReceiverChoice):
+class FleetIn(ForecastBase):
     """Heliostats, their common receiver, and their aim points."""
 
     heliostats: Heliostats = Field(
@@ -48,13 +48,6 @@ class FleetIn(ReceiverChoice):
         description=(
             "Names; all of the plant if not given, or those that its layout gives to the receiver."
             " The others cast shadows."
-        ),
-    )
-    aim_point_m: Position | None = Field(
-        default=None,
-        description=(
-            "Where all heliostats aim [m]; by default the receiver's middle, which is the middle of"
-            " a cavity's opening, and on a cylinder the point that faces each heliostat."
         ),
     )
     aim_points_m: dict[Name, Position] = Field(
@@ -69,16 +62,6 @@ class FleetIn(ReceiverChoice):
             " shades them."
         ),
     )
-    measured_states: Flag = Field(
-        default=True,
-        description=(
-            "Whether mirrors are as photographs measured them: dimmed, and with their pointing"
-            " errors. Otherwise, and with ideal surfaces, they are as declared."
-        ),
-    )
-    dni_w_m2: Sunlight = 1000.0
-    resolution: Resolution = (256, 256)
-    model_version: ModelVersion = None
 
     def fleet(self, runtime: Runtime) -> Fleet:
         """The heliostats as the store has them now."""

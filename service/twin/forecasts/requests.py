@@ -41,8 +41,11 @@ Surface = Annotated[
 ]
 
 
-class ReceiverChoice(Model):
-    """What the light falls on: a stored target or receiver, or another plane or receiver."""
+class ForecastBase(Model):
+    """What requests for one heliostat and for many have in common.
+
+    The light falls on a stored target or receiver, or on another plane or receiver.
+    """
 
     target: Name | None = Field(
         default=None, description="A stored target or receiver; either this, `plane` or `receiver`."
@@ -51,8 +54,28 @@ class ReceiverChoice(Model):
         default=None, description="Any plane; either this, `target` or `receiver`."
     )
     receiver: ReceiverIn | None = Field(
-        default=None, description="Any receiver; either this, `target` or `plane`."
+        default=None,
+        description=(
+            "Any receiver; either this, `target` or `plane`. The map of a cylinder is unrolled."
+        ),
     )
+    aim_point_m: Position | None = Field(
+        default=None,
+        description=(
+            "Where heliostats aim [m]; by default the receiver's middle, which is the middle of a"
+            " cavity's opening, and on a cylinder the point that faces each heliostat."
+        ),
+    )
+    measured_states: Flag = Field(
+        default=True,
+        description=(
+            "Whether mirrors are as photographs measured them: dimmed, and with their pointing"
+            " errors. Otherwise, and with ideal surfaces, they are as declared."
+        ),
+    )
+    dni_w_m2: Sunlight = 1000.0
+    resolution: Resolution = (256, 256)
+    model_version: ModelVersion = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -70,20 +93,11 @@ class ReceiverChoice(Model):
         return store.get_target_or_receiver(session, self.target)
 
 
-class ForecastIn(ReceiverChoice):
+class ForecastIn(ForecastBase):
     """A flux map to compute."""
 
     heliostat: Name
-    receiver: ReceiverIn | None = Field(
-        default=None,
-        description=(
-            "Any receiver; either this, `target` or `plane`. The map of a cylinder is unrolled."
-        ),
-    )
     sun: AnySun
-    aim_point_m: Position | None = Field(
-        default=None, description="Where the heliostat aims [m]; by default the receiver's middle."
-    )
     motor_position: MotorPosition | None = Field(
         default=None,
         description=(
@@ -99,8 +113,6 @@ class ForecastIn(ReceiverChoice):
             " surface is forecast by its ideal mirror; the first of `warnings` says so."
         ),
     )
-    dni_w_m2: Sunlight = 1000.0
-    resolution: Resolution = (256, 256)
     window_m: Number | None = Field(
         default=None,
         ge=0.01,
@@ -112,11 +124,6 @@ class ForecastIn(ReceiverChoice):
     normalised: Flag = Field(
         default=False, description="Scale the map to a sum of 100 instead of W/m2."
     )
-    measured_states: Flag = Field(
-        default=True,
-        description="Whether the mirror is as measured (dimmed, pointing error), or as declared.",
-    )
-    model_version: ModelVersion = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -1,7 +1,7 @@
 """Photographs that are sent again: fill missing fields, ignore different ones, report both."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -38,20 +38,14 @@ class ReceivedPhotograph:
     """Result of a sent photograph.
 
     ``is_new`` is whether it was not stored before. Otherwise ``filled`` and ``ignored`` name its
-    fields.
+    fields, and ``changes_flux`` is whether what was filled changes its flux.
     """
 
     row: MeasurementRow
     is_new: bool
     filled: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
-
-
-class _Filled(NamedTuple):
-    """A filled photograph, and whether it must be re-measured."""
-
-    received: ReceivedPhotograph
-    needs_measuring: bool
+    changes_flux: bool = False
 
 
 def receive(
@@ -197,7 +191,7 @@ def _fill(
     with runtime.database.reading() as session:
         twin = load_heliostat_context(session, heliostat)
 
-    def fill(session: Session) -> _Filled | None:
+    def fill(session: Session) -> ReceivedPhotograph | None:
         row = _lock(session, twin.row, present)
         if row is None:
             return None
@@ -219,7 +213,7 @@ def _fill(
             filled.append("id")
         received = ReceivedPhotograph(row, False, tuple(filled), tuple(ignored))
         if not filled:
-            return _Filled(received, False)
+            return received
         now_known = photograph_from_row(row)
         (contradiction,) = find_sun_contradictions([now_known], twin.origin)
         for name, value in sun_columns(row, now_known, contradiction).items():
@@ -237,13 +231,12 @@ def _fill(
         note_change(session, row.heliostat_id)
         subject = f"heliostat {heliostat} {row.identifier}"
         audit.record(session, actor, "measurement.filled", subject, fields=filled)
-        return _Filled(received, _changes_flux(twin, before, now_known))
+        return replace(received, changes_flux=_changes_flux(twin, before, now_known))
 
     done = runtime.database.run_in_transaction(fill)
-    if done is None or not done.needs_measuring:
-        return done and done.received
-    row = _remeasured(runtime, heliostat, done.received.row, actor)
-    return replace(done.received, row=row)
+    if done is None or not done.changes_flux:
+        return done
+    return replace(done, row=_remeasured(runtime, heliostat, done.row, actor))
 
 
 def _changes_flux(

@@ -31,8 +31,9 @@ from service.jobs.enqueuing import enqueue
 from service.jobs.kinds import predictions
 from service.jobs.kinds.predictions import PredictionsIn
 from service.sources.schema import WeatherFields
+from service.store.deletion import Deleted
 from service.store.measurements import count_undated
-from service.store.photographs import list_corrections, made_from, newest_correction
+from service.store.photographs import MadeFrom, list_corrections, made_from, newest_correction
 from service.store.tables import MeasurementRow
 from service.twin.forecasts.aims import plant_time_zone
 from service.twin.photographs.batches import (
@@ -108,24 +109,10 @@ class CorrectionOut(BaseModel):
     after: dict[str, object] = Field(description="New values.")
 
 
-class DeletedOut(BaseModel):
-    """A deleted photograph, and what was made from it."""
-
-    deleted: list[str] = Field(description="Ids of the images that were deleted.")
-    surface_versions: list[int] = Field(
-        description="Versions of the heliostat's surface that were made from it; they say so."
-    )
-    forecasts: int = Field(description="How many forecasts were made with those.")
-
-
-class CorrectedOut(BaseModel):
+class CorrectedOut(MadeFrom):
     """A corrected photograph, and what was made from it before the correction."""
 
     measurement: MeasurementOut = Field(description="The photograph as it is now.")
-    surface_versions: list[int] = Field(
-        description="Versions of the heliostat's surface that were made from it as it was."
-    )
-    forecasts: int = Field(description="How many forecasts were made with those.")
     job: int | None = Field(
         description="The job that predicts the surface again, if one was requested."
     )
@@ -187,12 +174,7 @@ def patch_measurement(
         set_tag(response, newest_correction(session, row))
         made, measured = made_from(session, row), measurement_out(session, name, row)
     job = predict_again(runtime, name, identity.name) if correction.predict_again else None
-    return CorrectedOut(
-        measurement=measured,
-        surface_versions=list(made.surfaces),
-        forecasts=made.forecasts,
-        job=job,
-    )
+    return CorrectedOut(**dict(made), measurement=measured, job=job)
 
 
 @router.delete(_PATH, responses=problems(404), dependencies=[OPERATE])
@@ -205,19 +187,14 @@ def delete_measurement(
     only_this: Annotated[
         bool, Query(description="Delete only this image, not the photograph in all kinds.")
     ] = False,
-) -> DeletedOut:
+) -> Deleted:
     """Delete a photograph that was sent by mistake.
 
     All its images are deleted. Its files are deleted when nothing else refers to them. Surfaces
     that were made from it stay, and name it in `deleted`; predict them again. An import of a folder
     that holds the photograph brings it back.
     """
-    deleted = delete_photograph(runtime, name, measurement, reason, identity.name, only_this)
-    return DeletedOut(
-        deleted=list(deleted.images),
-        surface_versions=list(deleted.surfaces),
-        forecasts=deleted.forecasts,
-    )
+    return delete_photograph(runtime, name, measurement, reason, identity.name, only_this)
 
 
 @router.get(f"{_PATH}/corrections", responses=problems(404), dependencies=[READ])

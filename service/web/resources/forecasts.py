@@ -66,6 +66,7 @@ from service.web.auth.dependencies import (
     ZoneDep,
     require_json,
 )
+from service.web.resources.plant import PlaneOut
 from service.web.responses import formats
 from service.web.responses.formats import MediaType, json_answer, maps_answer
 from service.web.responses.lists import ListQuery, Page, page
@@ -74,22 +75,13 @@ from service.web.responses.pages import go_to, leave_for, named_by_field, render
 from service.web.responses.representations import Maps
 
 
-class ForecastReceiverOut(BaseModel):
+class ForecastReceiverOut(PlaneOut):
     """The receiver of a forecast.
 
-    The axis of a cylinder is behind its middle. The map of a cylinder is unrolled. That of panels
-    has them side by side.
+    The axis of a cylinder is behind its middle. The map of a cylinder is unrolled: its width is the
+    length of its arc. That of panels has them side by side: its width is their sum.
     """
 
-    center: tuple[float, float, float] = Field(
-        description="Its middle: east, north, up of the tower base [m]."
-    )
-    normal: tuple[float, float, float] = Field(description="Of the lit side, there.")
-    up: tuple[float, float, float] = Field(description="Unit vector up the map.")
-    width: float = Field(
-        description="[m]; of a cylinder the length of its arc, of panels their sum."
-    )
-    height: float = Field(description="[m]")
     radius: float | None = Field(default=None, description="Of a cylinder [m]; null: a plane.")
     opening_deg: float | None = Field(
         default=None, description="Angle of a cylinder's lit surface [deg]."

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from fastapi import APIRouter, Depends, Form, Request, Response, status
 from fastapi.responses import HTMLResponse
-from pydantic import BaseModel, Field, TypeAdapter, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 from sqlalchemy.orm import Session
 
 from model.errors import InvalidInputError
@@ -18,7 +18,7 @@ from model.plant import Plant, TargetPlane
 from model.receivers import Cavity
 from service import store
 from service.base.fields import JsonObject, Model, Plane, TargetOf, Wgs84, from_row
-from service.base.plant import KIND, ReceiverIn, TowerSize
+from service.base.plant import KIND, CavityIn, PanelsIn, PlaneReceiverIn, ReceiverIn, TowerSize
 from service.drawing.templates import figure
 from service.jobs.kinds import measurements
 from service.jobs.kinds.measurements import MeasurementsIn
@@ -59,8 +59,6 @@ from service.web.responses.pages import go_to_job, render
 Place = tuple[float, float, float]
 """East, north and up."""
 
-_ABSORPTANCE = Field(description="Share of the light that it absorbs [1].")
-
 
 class PlantOut(BaseModel):
     """The plant."""
@@ -92,28 +90,31 @@ class PlantOut(BaseModel):
     )
 
 
-class PanelOut(BaseModel):
-    """A rectangle."""
+class PlaneOut(BaseModel):
+    """A rectangle that light falls on. Imports may exceed the bounds of `Plane`."""
 
-    center: Place = Field(description="[m]")
+    center: Place = Field(description="Its middle: east, north, up of the tower base [m].")
     normal: Place = Field(description="Unit normal of the lit side.")
     up: Place = Field(description="Unit vector up its map.")
     width: float = Field(description="[m]")
     height: float = Field(description="[m]")
 
 
-class PlaneReceiverOut(PanelOut):
+class _Stored(BaseModel):
+    """What answers add to a target or receiver: its name, and defaults are never left out."""
+
+    model_config = ConfigDict(extra="ignore", json_schema_serialization_defaults_required=True)
+
+    name: TargetOf
+
+
+class PlaneReceiverOut(PlaneReceiverIn, _Stored):
     """A flat receiver."""
 
-    name: TargetOf
-    kind: Literal["plane"] = KIND
-    absorptance: float = _ABSORPTANCE
 
+class CylinderOut(_Stored):
+    """A cylindrical receiver. PAINT's may exceed the bounds of `CylinderIn`."""
 
-class CylinderOut(BaseModel):
-    """A cylindrical receiver."""
-
-    name: TargetOf
     kind: Literal["cylinder"] = KIND
     center: Place = Field(description="The middle of the lit surface [m].")
     normal: Place = Field(description="Unit normal there, away from the axis.")
@@ -121,26 +122,15 @@ class CylinderOut(BaseModel):
     radius: float = Field(description="[m]")
     height: float = Field(description="[m]")
     opening_deg: float = Field(description="Angle of the lit surface [deg].")
-    absorptance: float = _ABSORPTANCE
+    absorptance: float = Field(description="Share of the light that it absorbs [1].")
 
 
-class PanelsOut(BaseModel):
+class PanelsOut(PanelsIn, _Stored):
     """A receiver of panels side by side."""
 
-    name: TargetOf
-    kind: Literal["panels"] = KIND
-    panels: list[PanelOut] = Field(description="From left to right.")
-    absorptance: float = _ABSORPTANCE
 
-
-class CavityOut(BaseModel):
+class CavityOut(CavityIn, _Stored):
     """Panels behind an opening."""
-
-    name: TargetOf
-    kind: Literal["cavity"] = KIND
-    aperture: list[Place] = Field(description="Corners of the opening [m].")
-    panels: list[PanelOut] = Field(description="From left to right.")
-    absorptance: float = _ABSORPTANCE
 
 
 ReceiverOut = Annotated[
@@ -198,15 +188,9 @@ class TargetIn(Model):
         return plane.located_by({"marks": "none"} | given)
 
 
-class TargetOut(BaseModel):
+class TargetOut(PlaneOut, _Stored):
     """A target plane."""
 
-    name: TargetOf
-    center: tuple[float, float, float] = Field(description="East, north, up of the tower base [m].")
-    normal: tuple[float, float, float] = Field(description="Unit normal of the lit side.")
-    up: tuple[float, float, float] = Field(description="Unit vector up the image.")
-    width: float = Field(description="[m]")
-    height: float = Field(description="[m]")
     corners: dict[str, object] | None = Field(
         description="The WGS84 corners that it was made from, if it was."
     )

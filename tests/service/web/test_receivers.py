@@ -87,6 +87,22 @@ def test_plant_document_brings_receivers_and_tower(client: TestClient, tower: di
     assert again.json()["tower_size"] == {"radius_m": 8, "height_m": 120}
 
 
+def test_answers_take_what_documents_may_bring_beyond_the_bounds_of_requests(
+    client: TestClient, tower: dict[str, Any]
+):
+    """PAINT's corners have no bounds but the shape: a sheet of 1.8 km."""
+    places = {
+        f"{row}_{column}": [50.9, 6.3 + east, height]
+        for row, height in (("upper", 1600.0), ("lower", 100.0))
+        for column, east in (("left", 0.025), ("right", 0.0))
+    }
+    wide = {"wide": {"type": "planar", "coordinates": places}}
+    assert client.put("/v1/plant?reason=surveyed", json=tower | wide).status_code == 200
+    answer = client.get("/v1/targets/wide")
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["width"] > 1e3
+
+
 def test_part_of_an_unknown_type_is_refused_not_dropped(
     refusing: TestClient, tower: dict[str, Any]
 ):
