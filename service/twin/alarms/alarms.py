@@ -628,7 +628,8 @@ def _ended_effects(session: Session, effects: EffectFindings) -> Iterator[Alarm]
         same = [other for other in effects.contradicted if other.study == one.study]
         offer = None
         if all(other.can_end for other in same):
-            offer = offers.adopt(one.study, {other.effect: other.until for other in same})
+            ends = {other.effect: other.until for other in same}
+            offer = offers.adopt(one.study, ends, one.in_words)
         elif model_versions.is_current(session, one.study):
             offer = offers.withdraw(one.study)
         yield Alarm(
@@ -647,15 +648,18 @@ def _undecided(adoptable: AdoptableStudy | None) -> Iterator[Alarm]:
     if adoptable is not None:
         study, ends, change = adoptable
         gain = change.whole
+        better = (
+            f"with its effects the accuracy changes by {100 * gain.mean:+.1f} points on"
+            f" {gain.photographs} photographs"
+        )
         yield Alarm(
             "study_undecided",
             None,
             study.created_at,
-            f"study {study.id} says: {study.conclusion.rstrip('.')}; with its effects the accuracy"
-            f" changes by {100 * gain.mean:+.1f} points on {gain.photographs} photographs",
+            f"study {study.id} says: {study.conclusion.rstrip('.')}; {better}",
             f"adopt it, see /studies/{study.id}/change",
             str(study.id),
-            offer=offers.adopt(study.id, ends),
+            offer=offers.adopt(study.id, ends, better),
         )
 
 

@@ -67,11 +67,16 @@ def has_seen(studies: Iterable[Studied], until: datetime, heliostat: str | None 
     )
 
 
-def adopt(number: int, ends: Mapping[str, date]) -> Offer:
-    """Adopt a study, whose effects have some ``ends``."""
+def adopt(number: int, ends: Mapping[str, date], reason: str) -> Offer:
+    """Adopt a study, whose effects have some ``ends``, for a ``reason``."""
     until = {effect: day.isoformat() for effect, day in ends.items()}
     said = f", ended by {', '.join(sorted(set(until.values())))}" if until else ""
-    return _post(f"Adopt study {number}{said}", f"/v1/studies/{number}/adopt", until=until)
+    return _post(
+        f"Adopt study {number}{said}",
+        f"/v1/studies/{number}/adopt",
+        until=until,
+        reason=reason[:200],
+    )
 
 
 def withdraw(number: int) -> Offer:

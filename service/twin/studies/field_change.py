@@ -26,6 +26,7 @@ from service.base.errors import ConflictError, ServiceError
 from service.base.fields import MeanGain
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import model_versions
+from service.twin.adoption_rules import undistinguished
 from service.twin.measurements import accepted_measurement, heights_of, load_heliostat_context
 from service.twin.model_versions import Ends, ModelVersion, effect_key, effect_text, without
 from service.twin.runtime import Runtime
@@ -363,13 +364,16 @@ class EffectWatch:
         return EffectFindings([one for one in found if one is not None], self._find_adoptable())
 
     def _find_adoptable(self) -> AdoptableStudy | None:
-        """The newest study if REST adopts it without force, and photographs are better with it."""
+        """The newest study if REST adopts it without force, and photographs are better with it.
+
+        They are the reason to adopt what leaves most of the error.
+        """
         with self._runtime.database.reading() as session:
             study = store.newest_study(session)
             state = None if study is None else study_states(session, [study])[study.id]
         if study is None or state is None or state.state != "candidate":
             return None
-        if state.questions or state.warnings or state.findings.is_correction:
+        if undistinguished(state.findings) or state.warnings or state.findings.is_correction:
             return None
         ends = dict[str, date]()
         change = read_field_change(self._runtime, study.id, None, self._gains)
