@@ -4,9 +4,9 @@ The demonstration's generator makes fields over eight weeks with every kind of f
 strong or weak, and fields without a fault. A robot takes the first action that REST offers for each
 alarm, studies and their adoption included, until nothing is offered. Photographs of two further
 weeks, which the store never gets, judge each action: a copy of the store forecasts them before and
-after. The oracle is the same field with nothing but its changed mirrors, which were always so; its unseen
-photographs have the declared camera, too. Its surfaces of heliostats that have faults are refined,
-as the robot refines them.
+after. The oracle is the same field with nothing but its changed mirrors, which were always so; its
+unseen photographs have the declared camera, too. Its surfaces of heliostats that have faults are
+refined, as the robot refines them.
 
 ``results/shift.json`` is written after each field, so an interrupted run keeps what it has.
 """
