@@ -627,6 +627,7 @@ def main() -> None:
         action="store_true",
         help="only worlds in which spots are moved, by their motors",
     )
+    parser.add_argument("--record", default="study", help="name of the file of results")
     options = parser.parse_args()
     if options.moving:
         with recording("study-moving"):
@@ -651,7 +652,7 @@ def main() -> None:
             print("\n".join(calibration(records)))
         return
     states = len({r["code"] for r in records})
-    with recording("study"):
+    with recording(options.record):
         text = [*summary(records), "", *table(records), "", *parameters(records)]
     text += [f"Answered by {states} states of the code."] if states > 1 else []
     (options.out / "study.md").write_text("\n".join(text) + "\n", encoding="utf-8")
