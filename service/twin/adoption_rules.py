@@ -75,25 +75,25 @@ def open_questions(findings: StudyFindings) -> list[OpenQuestion]:
         remedy = "See in the report what it varies with, and let a study try more effects."
         finding = f"{findings.share_left:.0%} of the error beyond noise is unexplained"
         questions.append(OpenQuestion(finding, remedy))
-    return [*questions, *undistinguished(findings)]
-
-
-def undistinguished(findings: StudyFindings) -> list[OpenQuestion]:
-    """Which effects look alike.
-
-    Of two that only images of targets show, either will do: neither changes a forecast for a
-    receiver, and photographs show no difference.
-    """
-    questions = []
     for effect in () if findings.is_correction else findings.effects:
         photographs = effect.get("told_apart_by", {})
         for other in effect.get("lookalikes", ()):
-            if _is_of_images(effect["name"]) and _is_of_images(other):
-                continue
             finding = f"the photographs cannot distinguish {effect['name']} from {other}"
             remedy = f"To decide, photograph {photographs[other]}." if other in photographs else ""
             questions.append(OpenQuestion(finding.replace("_", " "), remedy))
     return questions
+
+
+def is_ambiguous(findings: StudyFindings) -> bool:
+    """Whether an effect looks like another one that changes forecasts for receivers otherwise.
+
+    Of two that only images of targets show, either will do.
+    """
+    return any(
+        not (_is_of_images(effect["name"]) and _is_of_images(other))
+        for effect in findings.effects
+        for other in effect.get("lookalikes", ())
+    )
 
 
 def _is_of_images(name: str) -> bool:

@@ -26,7 +26,7 @@ from service.base.errors import ConflictError, ServiceError
 from service.base.fields import MeanGain
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import model_versions
-from service.twin.adoption_rules import undistinguished
+from service.twin.adoption_rules import is_ambiguous
 from service.twin.measurements import accepted_measurement, heights_of, load_heliostat_context
 from service.twin.model_versions import Ends, ModelVersion, effect_key, effect_text, without
 from service.twin.runtime import Runtime
@@ -373,7 +373,7 @@ class EffectWatch:
             state = None if study is None else study_states(session, [study])[study.id]
         if study is None or state is None or state.state != "candidate":
             return None
-        if undistinguished(state.findings) or state.warnings or state.findings.is_correction:
+        if is_ambiguous(state.findings) or state.warnings or state.findings.is_correction:
             return None
         ends = dict[str, date]()
         change = read_field_change(self._runtime, study.id, None, self._gains)

@@ -3,7 +3,7 @@
 import pytest
 
 from service.store.results import StudyFindings
-from service.twin.adoption_rules import names_of, open_questions, why_refused
+from service.twin.adoption_rules import is_ambiguous, names_of, open_questions, why_refused
 
 BETTER, WORSE = {"before": 0.90, "after": 0.95}, {"before": 0.931, "after": 0.92}
 
@@ -37,3 +37,17 @@ def test_a_correction_is_no_cause_and_answers_for_what_it_leaves_itself():
     found = correction(heliostats=BETTER)
     assert names_of(found) == ["correction (no cause)"]
     assert open_questions(found) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "expected"),
+    [
+        ("camera_shoulder", "camera_response", False),
+        ("camera_shoulder", "slope_error", True),
+        ("sun_shape", "slope_error", True),
+    ],
+)
+def test_of_two_effects_of_images_either_will_do(name: str, other: str, expected: bool):
+    found = StudyFindings("effect", [{"name": name, "lookalikes": [other]}], 0.1)
+    assert is_ambiguous(found) is expected
+    assert len(open_questions(found)) == 1  # which a person sees in either case
