@@ -155,7 +155,8 @@ _SIGNS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 def _components(places: Array, sizes: Array, axes: Array) -> Labels:
     """Numbers (n,) of groups of elements whose sides meet in one plane, with a gap at most."""
-    pairs = _pairs(places, float(np.hypot(*sizes.T).max()))
+    with_gap = sizes + _GAP * sizes.min(axis=1, keepdims=True)
+    pairs = _pairs(places, float(np.hypot(*with_gap.T).max()))
     first, second = pairs.T
     way = np.abs(np.einsum("nij,nj->ni", axes[first], places[second] - places[first]))
     reach = (sizes[first] + sizes[second]) / 2

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from model.errors import InvalidInputError
@@ -141,6 +141,7 @@ def test_an_export_returns_facet_by_facet(
     gap=st.floats(0.0, 0.1),
     seed=st.integers(0, 99),
 )
+@example(rows=2, columns=1, width=0.5, height=2.0, gap=0.1, seed=0)  # apart by over a diagonal
 def test_any_grid_of_facets_returns(
     tmp_path_factory: pytest.TempPathFactory,
     rows: int,
