@@ -122,7 +122,8 @@ class ForwardSelection:
             return few_gain(held_out.changes)
         both = [held_out, *self._cross_fitted(term, after, before, with_position)]
         changes, names = (np.concatenate(parts) for parts in zip(*both, strict=True))
-        if not term.is_per_heliostat or not len(changes):
+        # Drives slip one by one, mirrors are bent by what they have in common.
+        if not term.is_per_heliostat or term.kind.only_moves or not len(changes):
             return few_gain(changes)
         return clustered_gain([changes[names == name] for name in np.unique(names)])
 
