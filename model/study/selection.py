@@ -174,7 +174,8 @@ class ForwardSelection:
         simpler = {
             term: t
             for term, t in significant.items()
-            if SIMPLER * _complexity(term, t) <= _complexity(best, significant[best])
+            if best.days
+            and SIMPLER * _complexity(term, t) <= _complexity(best, significant[best])
             and self.gain(t, current).mean >= most
         }
         if simpler:
