@@ -123,12 +123,12 @@ class GenericModel:
     def _applied(
         self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
     ) -> Array:
-        if kind.operator != "light" and kind.basis is None:
-            return np.asarray(spots.images + self.traces.deformation(kind, rows, coefficients))
-        if kind.basis is None:
+        if kind.basis is not None:
+            return changed_images(kind, spots, coefficients)
+        if kind.operator == "light":
             changes = self.traces.changes(kind, rows, coefficients)
             return np.asarray(spots.images + np.einsum("nk,knij->nij", coefficients, changes))
-        return changed_images(kind, spots, coefficients)
+        return np.asarray(spots.images + self.traces.deformation(kind, rows, coefficients))
 
 
 class TracedTerms:

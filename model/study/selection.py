@@ -8,11 +8,12 @@ it, with a 95 % interval. An effect is worthwhile if the lower end of the interv
 the mean is above a minimum.
 
 Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
-added. So is one that is much simpler than the best and gains most of what that gains: what it
-leaves may be another effect's. After each addition effects that are no longer worthwhile are
-pruned.
+added. If the best has values by day, a much simpler one that gains most of that goes before it:
+what it leaves may be another effect's. After each addition effects that are no longer worthwhile
+are pruned.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -50,8 +51,8 @@ MIN_DISTINCTION = 0.001
 """Smallest gain of one effect over another that distinguishes them."""
 
 SIMPLER, MOST = 4, 2 / 3
-"""How many times fewer values a simpler effect has, and the share of the best one's gain that it
-must have. Values for each day also absorb what is another effect's.
+"""How many times fewer values than one by day an effect must have, and the share of its gain, to go
+before it. Values for each day also absorb what is another effect's.
 """
 
 
@@ -120,17 +121,17 @@ class ForwardSelection:
             return few_gain(held_out.changes, among=MAX_SCREENED)
         if with_position and not held_out.changes.sum() > 0:
             return few_gain(held_out.changes)
-        both = [held_out, *self._cross_fitted(term, after, before, with_position)]
-        changes, names = (np.concatenate(parts) for parts in zip(*both, strict=True))
-        # Drives slip one by one, mirrors are bent by what they have in common.
-        if not term.is_per_heliostat or term.kind.only_moves or not len(changes):
+        fitted = self._cross_fitted(term, after, before, with_position)
+        changes = np.concatenate([held_out.changes, fitted.changes])
+        names = np.concatenate([held_out.heliostats, fitted.heliostats])
+        if not term.is_per_heliostat or not len(changes):
             return few_gain(changes)
         return clustered_gain([changes[names == name] for name in np.unique(names)])
 
     def _cross_fitted(
         self, term: Term, after: Trial, before: Trial, with_position: bool
-    ) -> "list[_ScoreChanges]":
-        """Changes of the fitted images, by a fit to the held-out ones; none without images."""
+    ) -> "_ScoreChanges":
+        """Changes of the fitted images, by a fit to the held-out ones."""
         fitter = self.fitter
         crossed = replace(after, values=before.parameters.transfer(before.values, after.parameters))
         moving = fitter.unknowns.of_terms([term])
@@ -139,14 +140,14 @@ class ForwardSelection:
         )
         rows = fitter.touched(fitter.split.fitted, [term])
         if not len(rows):
-            return []
+            return _ScoreChanges(np.empty(0), np.empty(0, dtype=np.str_))
         judge = fitter.forecasters(rows).fine
         first, second = (
             _Forecasts(judge.cuts(trial.effects), judge.position_residuals(trial.effects))
             for trial in (before, crossed)
         )
         measured, names = judge.measured(FLUX_SIZE), fitter.heliostats[rows]
-        return [_ScoreChanges.of(measured, first, second, names, with_position)]
+        return _ScoreChanges.of(measured, first, second, names, with_position)
 
     def is_worthwhile(self, term: Term, gain: Gain) -> bool:
         """Whether a gain by an effect is significant and large enough."""
@@ -169,17 +170,7 @@ class ForwardSelection:
         }
         if not significant:
             return None
-        best = max(significant, key=lambda term: significant[term].score.mean())
-        most = MOST * self.gain(significant[best], current).mean
-        simpler = {
-            term: t
-            for term, t in significant.items()
-            if best.days
-            and SIMPLER * _complexity(term, t) <= _complexity(best, significant[best])
-            and self.gain(t, current).mean >= most
-        }
-        if simpler:
-            best = max(simpler, key=lambda term: simpler[term].score.mean())
+        best = self._best(significant, current)
         alike = [
             term
             for term, t in significant.items()
@@ -193,6 +184,24 @@ class ForwardSelection:
         is_nested = self.scopes.has_full_scope(chosen)
         gain = self._nested_gain(significant, current) if is_nested else gains[chosen]
         return Choice(chosen, gain, others) if self.is_worthwhile(chosen, gain) else None
+
+    def _best(self, trials: dict[Term, Trial], current: Trial) -> Term:
+        """The term of the best score; for values by day a much simpler one, if there is any."""
+
+        def of_best_score(terms: Iterable[Term]) -> Term:
+            return max(terms, key=lambda term: trials[term].score.mean())
+
+        best = of_best_score(trials)
+        if not best.days:
+            return best
+        most = _complexity(best, trials[best]) / SIMPLER
+        least = MOST * self.gain(trials[best], current).mean
+        simpler = [
+            term
+            for term, trial in trials.items()
+            if _complexity(term, trial) <= most and self.gain(trial, current).mean >= least
+        ]
+        return of_best_score(simpler) if simpler else best
 
     def _nested_gain(self, trials: dict[Term, Trial], current: Trial) -> Gain:
         """Gain of the best trial: each half of the images judges the choice by the other."""

@@ -57,7 +57,7 @@ class BeamChange:
 
     def transfer(self, right: Tensor, up: Tensor) -> Tensor:
         """Transfer function (B, R, C) at frequencies right (1, C) and up (R, 1) [cycles/m]."""
-        phases = self._phases(right, up)
+        phases = [_phase(move, right, up) for move in self.moves.unbind(1)]
         terms = [*sun_moments(*phases[:2]), *axis_moments(*phases[2:])]
         factors = self.moments[:, : len(terms)].unbind(1)
         total = sum(c[:, None, None] * term for c, term in zip(factors, terms, strict=True))
@@ -65,17 +65,16 @@ class BeamChange:
         return torch.exp(torch.complex(exponent.real.clamp(max=MAX_SHARPENING), exponent.imag))
 
     def sun_stretch(self, right: Tensor, up: Tensor) -> Tensor:
-        """What the sun's new size adds to the square (B, R, C) [1/rad2] of frequencies that are
-        seen from the mirror, at frequencies right (1, C) and up (R, 1) [cycles/m].
+        """What the sun's new size adds to the square (B, R, C) [cycles2/rad2] of frequencies that
+        are seen from the mirror, at frequencies right (1, C) and up (R, 1) [cycles/m].
         """
         sizes = (1 + self.moments[:, -2:]).clamp(min=0)
-        sidewards, upwards, *_ = (1e3 / (2 * math.pi) * a for a in self._phases(right, up))
-        across, along = (sizes**2 - 1)[:, :, None, None].unbind(1)
-        return across * sidewards**2 + along * upwards**2
+        moves = self.moves.unbind(1)[:2]
+        a, b = (1e3 / (2 * math.pi) * _phase(move, right, up) for move in moves)
+        sidewards, upwards = (sizes**2 - 1)[:, :, None, None].unbind(1)
+        return sidewards * a**2 + upwards * b**2
 
-    def _phases(self, right: Tensor, up: Tensor) -> list[Tensor]:
-        """Phases (B, R, C) [1/mrad] by each turn."""
-        return [
-            2 * math.pi * (move[:, 0, None, None] * right + move[:, 1, None, None] * up)
-            for move in self.moves.unbind(1)
-        ]
+
+def _phase(move: Tensor, right: Tensor, up: Tensor) -> Tensor:
+    """Phases (B, R, C) [1/mrad] by a turn that moves light by (B, 2) [m/mrad]."""
+    return 2 * math.pi * (move[:, 0, None, None] * right + move[:, 1, None, None] * up)
