@@ -240,6 +240,10 @@ class MeasurementRow(Base):
         """The recorded sun."""
         return Sun(azimuth_deg=self.sun_azimuth_deg, elevation_deg=self.sun_elevation_deg)
 
+    def warning(self, type_: str) -> dict[str, Any] | None:
+        """Its warning of a type; None without any."""
+        return next((one for one in self.warnings or () if one["type"] == type_), None)
+
     @property
     def has_file(self) -> bool:
         """Whether the store has an image file of it."""

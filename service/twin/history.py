@@ -332,8 +332,8 @@ def heliostat_history(session: Session, row: HeliostatRow, images: Mapping[str, 
 
 
 def _unlike(row: MeasurementRow) -> _Object | None:
-    found = (one for one in row.warnings or () if one["type"] == UNLIKE_HELIOSTAT)
-    return next(({name: one[name] for name in ("detail", "like")} for one in found), None)
+    found = row.warning(UNLIKE_HELIOSTAT)
+    return None if found is None else {name: found[name] for name in ("detail", "like")}
 
 
 def _drift(session: Session, row: HeliostatRow, names: Mapping[int, str]) -> Any:

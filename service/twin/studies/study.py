@@ -213,8 +213,7 @@ def _chosen_measurements(
     unlike = {
         one.identifier: str(warning["detail"])
         for one in found
-        for warning in one.warnings or ()
-        if warning["type"] == UNLIKE_HELIOSTAT
+        if (warning := one.warning(UNLIKE_HELIOSTAT)) is not None
     }
     skipped |= {f"{row.name}/{name}": detail for name, detail in unlike.items()}
     return [one for one in found if one.identifier not in unlike]

@@ -82,6 +82,7 @@ def test_a_clock_is_corrected_by_one_button_for_all(client: TestClient, post: Po
         ("/v1/jobs/predictions", {"heliostats": ["AA39"]}, 303),
         ("/v1/heliostats/AA39/measurements/1", {"excluded": True, "reason": "clouds"}, 303),
         ("/v1/studies/7/adopt", {}, 404),
+        ("/v1/heliostats/AA39/surfaces/current", {"version": 7, "reason": "as offered"}, 404),
     ],
 )
 def test_buttons_do_what_rest_does(
@@ -91,6 +92,26 @@ def test_buttons_do_what_rest_does(
     asked = {"path": path, "body": body, "back": "/heliostats/AA39"}
     done = client.post("/offers", data={"offer": json.dumps(asked)}, follow_redirects=False)
     assert done.status_code == status, done.text
+
+
+@pytest.mark.parametrize("by_page", [False, True])
+def test_a_surface_is_made_active_as_offered(client: TestClient, post: Post, by_page: bool):
+    for number in (1, 2):
+        assert post(image(number), id=f"{number}").status_code == 201
+        body = {"measurements": [f"{number}"]}
+        assert client.post("/v1/heliostats/AA39/surfaces", json=body).status_code == 201
+    active = client.get("/v1/heliostats/AA39/surfaces/current").json()["version"]
+    offer = offers.activate("AA39", 3 - active, "the mirror changed")
+    if by_page:
+        asked = {**offer, "back": "/heliostats/AA39"}
+        done = client.post("/offers", data={"offer": json.dumps(asked)}, follow_redirects=False)
+        assert (done.status_code, done.headers["Location"]) == (303, "/heliostats/AA39")
+    else:
+        send(client, dict(offer))
+    chosen = client.get("/v1/heliostats/AA39/surfaces/current").json()["version"]
+    assert chosen == 3 - active
+    (last, *_) = client.get("/v1/heliostats/AA39/surfaces/decisions").json()["items"]
+    assert last["reason"] == "the mirror changed"
 
 
 def test_a_page_never_leads_elsewhere(client: TestClient):
