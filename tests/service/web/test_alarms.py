@@ -337,6 +337,8 @@ def test_clock_that_went_wrong_until_it_is_calibrated_without(calibrating: TestC
     (item,) = of(client, "clock")
     assert item["message"].startswith("from 2024-05-09 on the clock was 2.")
     assert (item["heliostat"], item["since"]) == (None, "2024-05-09T00:00:00Z")
+    for page in ("/alarms", "/alarms/history"):
+        assert "rom 2024-05-09 on the clock was 2." in client.get(page, headers=HTML).text
     for name in names:
         for one in right[8:]:
             sun = {"sun": one["sun"]}

@@ -137,7 +137,7 @@ def test_adopted_correction_that_ended_gets_its_end(app: FastAPI, hazy: TestClie
     (alarm,) = alarms(hazy)
     assert alarm["message"].startswith("correction makes 6 photographs since 2026-06-07 worse")
     offer = alarm["offer"]
-    assert offer["body"]["until"] == {"correction": "2026-06-07"}
+    assert offer["body"] == {"until": {"correction": "2026-06-07"}, "reason": alarm["message"]}
     assert hazy.request(offer["method"], offer["path"], json=offer["body"]).status_code == 201
     assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
     assert alarms(hazy) == []
@@ -155,7 +155,11 @@ def test_adopted_effect_that_ended_raises_an_alarm_until_it_gets_its_end(
     assert alarm["action"] == "end it by 2026-06-07, see /studies/1/change"
     change = change_page(hazy)
     assert "End slope error by 2026-06-07" in change
-    assert alarm["offer"]["body"]["until"] == {"slope_error": "2026-06-07"}
+    assert alarm["offer"]["body"] == {
+        "until": {"slope_error": "2026-06-07"},
+        "reason": alarm["message"],
+    }
+    assert "End it by 2026-06-07, see" in hazy.get("/alarms", headers=HTML).text
     form = {"ended": "slope_error 2026-06-07", "current": "2"}
     assert hazy.post("/studies/1/adopt", data=form, follow_redirects=False).status_code == 303
     assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
@@ -171,6 +175,7 @@ def test_a_study_that_helps_is_offered_with_its_end(app: FastAPI, hazy: TestClie
     assert "with its effects the accuracy changes by +5.0 points on 12 photo" in alarm["message"]
     offer = alarm["offer"]
     assert offer["label"] == "Adopt study 1, ended by 2026-06-07"
+    assert offer["label"] in hazy.get("/alarms", headers=HTML).text
     assert hazy.request(offer["method"], offer["path"], json=offer["body"]).status_code == 201
     assert effects(hazy)[0]["scope"] == SINCE | {"until": "2026-06-07"}
     assert (alarms(hazy, "study_undecided"), alarms(hazy)) == ([], [])
