@@ -13,7 +13,6 @@ what it leaves may be another effect's. After each addition effects that are no 
 are pruned.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -72,10 +71,8 @@ class ForwardSelection:
         self.fitter, self.scopes, self.options = fitter, scopes, fitter.options
         self.heliostats = fitter.judged_heliostats
         held_out = [fitter.flux_images[row] for row in fitter.split.held_out]
-        has_motors = [p.setup.angles is not None for p in held_out]
-        self.noise = noise_floor(held_out, fitter.window) + NAT * EXPECTED * float(
-            np.mean(has_motors)
-        )
+        with_motors = float(np.mean([p.setup.angles is not None for p in held_out]))
+        self.noise = noise_floor(held_out, fitter.window) + NAT * EXPECTED * with_motors
 
     def refit_best(self, trials: dict[Term, Trial]) -> dict[Term, Trial]:
         """Re-fit the best trials jointly with the effects found before."""
@@ -187,30 +184,24 @@ class ForwardSelection:
 
     def _best(self, trials: dict[Term, Trial], current: Trial) -> Term:
         """The term of the best score; for values by day a much simpler one, if there is any."""
-
-        def of_best_score(terms: Iterable[Term]) -> Term:
-            return max(terms, key=lambda term: trials[term].score.mean())
-
-        best = of_best_score(trials)
+        best = _of_best_score(trials)
         if not best.days:
             return best
         most = _complexity(best, trials[best]) / SIMPLER
         least = MOST * self.gain(trials[best], current).mean
-        simpler = [
-            term
+        simpler = {
+            term: trial
             for term, trial in trials.items()
             if _complexity(term, trial) <= most and self.gain(trial, current).mean >= least
-        ]
-        return of_best_score(simpler) if simpler else best
+        }
+        return _of_best_score(simpler or trials)
 
     def _nested_gain(self, trials: dict[Term, Trial], current: Trial) -> Gain:
         """Gain of the best trial: each half of the images judges the choice by the other."""
         second = np.arange(len(self.heliostats)) % 2 == 1
         differences = np.empty(len(second))
         for half in (second, ~second):
-            best = max(
-                trials.values(), key=lambda t: t.score[~half].mean() if (~half).any() else 0.0
-            )
+            best = trials[_of_best_score(trials, ~half)]
             differences[half] = (best.score - current.score)[half]
         return paired_gain(differences, self.heliostats)
 
@@ -222,6 +213,14 @@ class ForwardSelection:
             if not self.is_worthwhile(term, self.gain_where_acting(term, current, reduced)):
                 current = reduced
         return current
+
+
+def _of_best_score(
+    trials: dict[Term, Trial], judging: NDArray[np.bool_] | slice = slice(None)
+) -> Term:
+    """The term of the best mean score on the images that judge; the first, if none does."""
+    scores = {term: trial.score[judging] for term, trial in trials.items()}
+    return max(scores, key=lambda term: float(scores[term].mean()) if len(scores[term]) else 0.0)
 
 
 def is_distinct(gain: Gain) -> bool:

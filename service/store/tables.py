@@ -4,6 +4,7 @@ Arrays are compressed npz blobs that load on demand. Images are files
 (`service.store.image_files`), referred to by their SHA-256.
 """
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
@@ -240,7 +241,7 @@ class MeasurementRow(Base):
         """The recorded sun."""
         return Sun(azimuth_deg=self.sun_azimuth_deg, elevation_deg=self.sun_elevation_deg)
 
-    def warning(self, type_: str) -> dict[str, Any] | None:
+    def warning(self, type_: str) -> Mapping[str, Any] | None:
         """Its warning of a type; None without any."""
         return next((one for one in self.warnings or () if one["type"] == type_), None)
 
