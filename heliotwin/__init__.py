@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from model.errors import InvalidInputError
     from model.errors import ModelError as HeliotwinError
 
-__version__ = "1.0.0.dev0"
+__version__ = "1.0.0"
 
 __all__ = [
     "Comparison",

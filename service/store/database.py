@@ -236,12 +236,13 @@ class Database:
         return self.revision() == _newest_revision()
 
     def require_known(self) -> None:
-        """Raise `SchemaError` if another version of heliotwin made the schema."""
+        """Raise `SchemaError` if a version that this code does not know made the schema."""
         if (found := self.revision()) not in (None, *self.revisions()):
             raise SchemaError(
-                f"{self.url}: another version of heliotwin made this store (schema {found}, not"
-                f" {_newest_revision()}); make it again: delete it, or set HELIOTWIN_DATA_DIR or"
-                " HELIOTWIN_DATABASE_URL to a new one"
+                f"{self.url}: a newer version of heliotwin, or one before 1.0.0, made this store"
+                f" (schema {found}, not {_newest_revision()}); start that version, restore a"
+                " back-up of this one, or set HELIOTWIN_DATA_DIR or HELIOTWIN_DATABASE_URL to a new"
+                " store"
             )
 
     def require_current(self) -> None:

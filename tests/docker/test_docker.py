@@ -24,6 +24,7 @@ from alembic.script import ScriptDirectory
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import heliotwin
 from service.base.settings import Settings
 from service.store.database import alembic_config
 from service.twin.alarms.field_overview import FieldOverviewCache
@@ -159,7 +160,7 @@ def test_every_image_of_others_can_be_pinned(dockerfile: list[tuple[str, str]]):
     Dockerfile.
     """
     document = yaml.safe_load((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
-    own = "heliotwin:${HELIOTWIN_VERSION:-latest}"
+    own = f"heliotwin:${{HELIOTWIN_VERSION:-{heliotwin.__version__}}}"
     images = {service["image"] for service in document["services"].values()} - {own}
     images.add(document["x-service"]["build"]["args"]["PYTHON_IMAGE"])
     assert len(images) == 5
