@@ -53,6 +53,9 @@ DAYS, ARCHIVED, UNSEEN = 70, 42, 14  # [d] before the end: begin, import, and wh
 WORSE = 0.002
 """Loss of accuracy [1] on unseen photographs that makes an action a bad one."""
 
+MOST_BELOW = 12
+"""Heliostats that are printed with what they are below the oracle."""
+
 # Sizes as `Fault` has them: strong and weak.
 SIZES = {
     "facet canted": (6.0, 2.5),
@@ -344,27 +347,44 @@ def run_shift(
 # --------------------------------------------------------------------------------------------------
 
 _BETWEEN = re.compile(r"between (\S+ \S+) UTC and (\S+ \S+) UTC")
-_DATED = {"facet canted": "fell", "soiled": "dimmed", "drives stepped": "moved"}
+_DATED = {
+    "facet canted": "fell",
+    "camera changed": "fell",
+    "soiled": "dimmed",
+    "drives stepped": "moved",
+    "target moved": "moved",
+}
 
 
 def dates(client: TestClient, case: Case) -> list[bool]:
-    """Whether the interval of each dated alarm holds the first photograph after its change."""
+    """Whether the interval of each dated alarm holds the first photograph after a change.
+
+    Two faults may move the spots of a heliostat, such as its drives and the target.
+    """
     found = []
     for alarm in client.get("/v1/alarms", params={"limit": 500}).json()["items"]:
-        for fault in case.faults:
-            is_of = alarm["heliostat"] in fault.heliostats
-            if is_of and _DATED.get(fault.kind) == alarm["reason"]:
-                ends = _BETWEEN.search(alarm["message"])
-                assert ends is not None, alarm["message"]
-                begin, end = (datetime.fromisoformat(f"{one}+00:00") for one in ends.groups())
-                first = first_of(case, fault)
-                found.append(begin < first < end + timedelta(minutes=1))
+        name = alarm["heliostat"]
+        firsts = [
+            first_of(case, fault, name)
+            for fault in case.faults
+            if _DATED.get(fault.kind) == alarm["reason"]
+            and (not fault.heliostats or name in fault.heliostats)
+        ]
+        if firsts:
+            ends = _BETWEEN.search(alarm["message"])
+            assert ends is not None, alarm["message"]
+            begin, end = (datetime.fromisoformat(f"{one}+00:00") for one in ends.groups())
+            found.append(any(begin < one < end + timedelta(minutes=1) for one in firsts))
     return found
 
 
-def first_of(case: Case, fault: Fault) -> datetime:
-    """When the first photograph was taken that a fault acts on."""
-    return min(one.taken_at for one in case.photographs if fault.kind in one.faults)
+def first_of(case: Case, fault: Fault, name: str) -> datetime:
+    """When the first photograph of a heliostat was taken that a fault acts on."""
+    return min(
+        one.taken_at
+        for one in case.photographs
+        if fault.kind in one.faults and one.mirror.name == name
+    )
 
 
 def right(client: TestClient, case: Case, fault: Fault) -> bool:
@@ -382,7 +402,7 @@ def right(client: TestClient, case: Case, fault: Fault) -> bool:
     match fault.kind:
         case "facet canted":
             begun = epochs.get(names[0])
-            first = first_of(case, fault)
+            first = first_of(case, fault, names[0])
             is_known = any(one["name"] == "facet_canting" for one in now_acting)
             return is_known or (begun is not None and abs(begun - first) < timedelta(days=3))
         case "soiled":
@@ -486,6 +506,9 @@ def _try_field(root: Path, options: argparse.Namespace, seed: int, word: str) ->
     best = judge(root / "oracle", root / "ideal", as_meant)
     gain = mean(ended.values()) - mean(begun.values())
     gap = mean(best.values()) - mean(ended.values())
+    for name in sorted(ended, key=lambda one: ended[one] - best.get(one, 0.0))[:MOST_BELOW]:
+        kinds = ", ".join(one.kind for one in case.faults if name in one.heliostats)
+        print(f"{word}, seed {seed}: {name} {100 * (best[name] - ended[name]):.2f} below: {kinds}")
     return Result(made, found, dated, [gain], [gap])
 
 
