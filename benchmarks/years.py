@@ -31,7 +31,7 @@ from benchmarks import data_folder
 from benchmarks.folders import read_photographs
 from benchmarks.record import Estimate, log_row, recording
 from heliotwin.folder_pointing import calibrate_folder
-from model.effects import CATALOGUE, Effect, effect_to_json
+from model.effects import CATALOGUE, Effect, effect_to_json, effects_from_json
 from model.metrics import flux_accuracies
 from model.plant_model import JUELICH_MODEL
 from model.study import FluxImage, Study, StudyOptions, conclude, study, study_to_json
@@ -188,6 +188,35 @@ def main() -> None:
         return
     with recording("years"):
         of_halves(options.out)
+        of_one("AA31")
+
+
+def correction_cells(found: Study, unseen: Sequence[FluxImage]) -> dict[str, Any]:
+    """What has no name in a study, and what its correction gains on photographs of other days."""
+    if found.discrepancy is None:
+        return {}
+    days = [day_of(p) for p in unseen]
+    gain = accuracies(unseen, effects_from_json(study_to_json(found))) - accuracies(unseen, [])
+    cells: dict[str, Any] = {"what has no name": found.discrepancy.described}
+    cells["explains [%]"] = 100 * found.discrepancy.explained_share
+    cells["gain by its correction"] = Estimate(gain.mean(), interval(gain, days))
+    return cells
+
+
+def of_one(name: str) -> None:
+    """Print what a study of a mirror with few photographs says; days left out in turn judge it."""
+    taken, _ = read_photographs(read_folder(data_folder(), [name]))
+    found = study(taken, JUELICH_MODEL, options=StudyOptions(window=WINDOW))
+    print(f"{name}: {len(taken)} photographs: {conclude(found)}")
+    before, after = found.accuracy_before.mean(), found.accuracy_after.mean()
+    cells: dict[str, Any] = {"finds": described(found)}
+    cells |= {"accuracy without": before, "accuracy with": after}
+    if (unnamed := found.discrepancy) is not None:
+        cells["what has no name"] = unnamed.described
+        cells["explains [%]"] = 100 * unnamed.explained_share
+        if (days := unnamed.transfer["days"]) is not None:
+            cells["gain by its correction"] = days.after - days.before
+    log_row("Studies", f"{name}, all days", cells, n=len(taken), of="photographs")
 
 
 def of_halves(out: Path | None) -> None:
@@ -228,6 +257,7 @@ def of_halves(out: Path | None) -> None:
         cells = {"finds": described(found), "accuracy without": before.mean()}
         cells |= {"accuracy with": after.mean()}
         cells["gain"] = Estimate((after - before).mean(), (low, high))
+        cells |= correction_cells(found, unseen)
         log_row(
             "Studies", f"{name}, judged by the other days", cells, n=len(unseen), of="photographs"
         )
