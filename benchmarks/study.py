@@ -7,7 +7,8 @@ turn, and its sets are studied without it: the verdict's thresholds are chosen b
 adds a line of JSON to ``OUT/cases.jsonl``; a later call does what is missing, or was answered by
 another state of the code. ``OUT/study.md`` and ``OUT/matrix.png`` show them all. With ``--folders``
 the sets of ``../shared/undeclared``, whose effects are not known here, are studied instead; with
-``--moving`` worlds whose effects move spots, with and without what encoders said.
+``--moving`` worlds whose effects move spots, with and without what encoders said; with ``--cost``
+time and memory of one study of 100 images.
 """
 
 import argparse
@@ -15,14 +16,17 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from hashlib import sha256
 from multiprocessing import get_context
 from operator import itemgetter
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from time import process_time
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -31,12 +35,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks import data_folder
-from benchmarks.record import log_row, proportion, recording
+from benchmarks.record import Estimate, log_row, proportion, recording
 from heliotwin.folder_study import study_folder
 from model.effects import CATALOGUE as KINDS
 from model.metrics import flux_accuracies
 from model.plant_model import JUELICH_MODEL
-from model.study import Study, StudyOptions, study, study_to_json
+from model.study import FluxImage, Study, StudyOptions, loop, study, study_to_json
 from model.study.flux_images import Forecaster
 from service.sources.folder import read_folder
 from tests.undeclared.adapter import effects_of, flux_images
@@ -161,6 +165,43 @@ def flat(value: Any) -> Array:
     if isinstance(value, dict):
         return np.concatenate([flat(value[name]) for name in sorted(value)])
     return np.asarray(value, dtype=np.float64).ravel()
+
+
+# --- its cost
+# --------------------------------------------------------------------------------------------------
+
+
+def cost() -> None:
+    """Time and memory of a study of 100 images, without and with generic terms."""
+    taken = flux_images(generate("second_axis_wobble", 2, 0, heliostats=5, setups=20))
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
+        (first_s, first_mb), (seconds, memory_mb) = (
+            pool.submit(cost_of, taken, is_with).result() for is_with in (False, True)
+        )
+    rows = (
+        ("without generic terms", {"time [s]": first_s, "peak memory [MB]": first_mb}),
+        (
+            "with them",
+            {
+                "time [s]": seconds,
+                "time, ratio to that without": Estimate(seconds / first_s, goal="<= 1.5"),
+                "peak memory [MB]": Estimate(memory_mb, goal="<= 1000"),
+            },
+        ),
+    )
+    for row, cells in rows:
+        print(row, *cells.items())
+        log_row("A study of 100 images", row, cells, n=len(taken), of="images")
+
+
+def cost_of(taken: Sequence[FluxImage], is_with_terms: bool) -> tuple[float, float]:
+    """Time [s] of this process for a study, and its largest memory [MB]."""
+    torch.set_num_threads(1)
+    nothing = mock.patch.object(loop, "find_discrepancy", return_value=None)
+    with nullcontext() if is_with_terms else nothing:
+        start = process_time()
+        study(taken, JUELICH_MODEL)
+        return process_time() - start, getrusage(RUSAGE_SELF).ru_maxrss / 1024
 
 
 # --- all cases
@@ -627,11 +668,16 @@ def main() -> None:
         action="store_true",
         help="only worlds in which spots are moved, by their motors",
     )
+    parser.add_argument("--cost", action="store_true", help="only time and memory of one study")
     parser.add_argument("--record", default="study", help="name of the file of results")
     options = parser.parse_args()
     if options.moving:
         with recording("study-moving"):
             moving(range(options.first_seed, options.first_seed + options.seeds))
+        return
+    if options.cost:
+        with recording("study-cost"):
+            cost()
         return
     if options.folders:
         with recording("study-folders"):
