@@ -230,13 +230,13 @@ def _parameters(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> 
 
 
 LIMITS = {
-    "lines of code": 55_038,
+    "lines of code": 55_037,
     "words that WORDS.md replaces": 0,
     "names of two or more classes": 0,
     f"functions above {MAX_PARAMETERS} parameters": 0,
     "functions annotated -> tuple[..]": 49,
     f"classes above {MAX_CLASS_LINES} lines": 1,
-    "lines with latitude_deg": 17,
+    "lines with latitude_deg": 18,
     "names of a forecast request's fields": 23,
     "files in service": 198,
     "dict[str, Any] in service": 39,

@@ -241,8 +241,7 @@ class Database:
             raise SchemaError(
                 f"{self.url}: a newer version of heliotwin, or one before 1.0.0, made this store"
                 f" (schema {found}, not {_newest_revision()}); start that version, restore a"
-                " back-up of this one, or set HELIOTWIN_DATA_DIR or HELIOTWIN_DATABASE_URL to a new"
-                " store"
+                " back-up of this one, or name a new store in HELIOTWIN_DATABASE_URL"
             )
 
     def require_current(self) -> None:
