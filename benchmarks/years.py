@@ -191,15 +191,13 @@ def main() -> None:
         of_one("AA31")
 
 
-def correction_cells(found: Study, unseen: Sequence[FluxImage]) -> dict[str, Any]:
-    """What has no name in a study, and what its correction gains on photographs of other days."""
-    if found.discrepancy is None:
-        return {}
-    days = [day_of(p) for p in unseen]
-    gain = accuracies(unseen, effects_from_json(study_to_json(found))) - accuracies(unseen, [])
-    cells: dict[str, Any] = {"what has no name": found.discrepancy.described}
-    cells["explains [%]"] = 100 * found.discrepancy.explained_share
-    cells["gain by its correction"] = Estimate(gain.mean(), interval(gain, days))
+def study_cells(found: Study, before: Array, after: Array) -> dict[str, Any]:
+    """What a study finds, accuracies (N,) without and with its effects, and what has no name."""
+    cells: dict[str, Any] = {"finds": described(found)}
+    cells |= {"accuracy without": before.mean(), "accuracy with": after.mean()}
+    if (unnamed := found.discrepancy) is not None:
+        cells["what has no name"] = unnamed.described
+        cells["explains [%]"] = 100 * unnamed.explained_share
     return cells
 
 
@@ -208,14 +206,10 @@ def of_one(name: str) -> None:
     taken, _ = read_photographs(read_folder(data_folder(), [name]))
     found = study(taken, JUELICH_MODEL, options=StudyOptions(window=WINDOW))
     print(f"{name}: {len(taken)} photographs: {conclude(found)}")
-    before, after = found.accuracy_before.mean(), found.accuracy_after.mean()
-    cells: dict[str, Any] = {"finds": described(found)}
-    cells |= {"accuracy without": before, "accuracy with": after}
-    if (unnamed := found.discrepancy) is not None:
-        cells["what has no name"] = unnamed.described
-        cells["explains [%]"] = 100 * unnamed.explained_share
-        if (days := unnamed.transfer["days"]) is not None:
-            cells["gain by its correction"] = days.after - days.before
+    cells = study_cells(found, found.accuracy_before, found.accuracy_after)
+    unnamed = found.discrepancy
+    if unnamed is not None and (days := unnamed.transfer["days"]) is not None:
+        cells["gain by its correction"] = days.after - days.before
     log_row("Studies", f"{name}, all days", cells, n=len(taken), of="photographs")
 
 
@@ -226,11 +220,10 @@ def of_halves(out: Path | None) -> None:
     print(f"{len(taken)} photographs on {len({day_of(p) for p in taken})} days: {conclude(whole)}")
     before, after = whole.accuracy_before.mean(), whole.accuracy_after.mean()
     print(f"found: {described(whole)}; without effects {before:.4f}, with {after:.4f}")
-    verdict = {"finds": described(whole), "accuracy without": before, "accuracy with": after}
     log_row(
         "Studies",
         "all days, judged by held-out photographs",
-        verdict,
+        study_cells(whole, whole.accuracy_before, whole.accuracy_after),
         n=len(taken),
         of="photographs",
     )
@@ -254,10 +247,12 @@ def of_halves(out: Path | None) -> None:
         before, after = accuracies(unseen, []), accuracies(unseen, found.effects)
         low, high = interval(after - before, [day_of(p) for p in unseen])
         gain = f"{(after - before).mean():+.4f} [{low:+.4f}, {high:+.4f}]"
-        cells = {"finds": described(found), "accuracy without": before.mean()}
-        cells |= {"accuracy with": after.mean()}
+        cells = study_cells(found, before, after)
         cells["gain"] = Estimate((after - before).mean(), (low, high))
-        cells |= correction_cells(found, unseen)
+        if found.discrepancy is not None:
+            change = accuracies(unseen, effects_from_json(study_to_json(found))) - before
+            held = interval(change, [day_of(p) for p in unseen])
+            cells["gain by its correction"] = Estimate(change.mean(), held)
         log_row(
             "Studies", f"{name}, judged by the other days", cells, n=len(unseen), of="photographs"
         )

@@ -239,9 +239,9 @@ class Database:
         """Raise `SchemaError` if a version that this code does not know made the schema."""
         if (found := self.revision()) not in (None, *self.revisions()):
             raise SchemaError(
-                f"{self.url}: a newer version of heliotwin, or one before 1.0.0, made this store"
-                f" (schema {found}, not {_newest_revision()}); start that version, restore a"
-                " back-up of this one, or name a new store in HELIOTWIN_DATABASE_URL"
+                f"{self.url}: a newer version, or one before 1.0.0, made this store (schema"
+                f" {found}, not {_newest_revision()}); start that one, restore a back-up of this"
+                " one, or set HELIOTWIN_DATA_DIR or HELIOTWIN_DATABASE_URL to a new store"
             )
 
     def require_current(self) -> None:
