@@ -669,7 +669,6 @@ def main() -> None:
         help="only worlds in which spots are moved, by their motors",
     )
     parser.add_argument("--cost", action="store_true", help="only time and memory of one study")
-    parser.add_argument("--record", default="study", help="name of the file of results")
     options = parser.parse_args()
     if options.moving:
         with recording("study-moving"):
@@ -698,7 +697,7 @@ def main() -> None:
             print("\n".join(calibration(records)))
         return
     states = len({r["code"] for r in records})
-    with recording(options.record):
+    with recording("study"):
         text = [*summary(records), "", *table(records), "", *parameters(records)]
     text += [f"Answered by {states} states of the code."] if states > 1 else []
     (options.out / "study.md").write_text("\n".join(text) + "\n", encoding="utf-8")
