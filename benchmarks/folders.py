@@ -12,8 +12,8 @@ from model.pointing import Reading
 from model.study import FluxImage
 from service.sources.documents import IMAGE_KINDS
 from service.sources.folder import MeasurementFolder
-from service.twin.calibration import load_readings
 from service.twin.measurements import AcceptedMeasurement, accepted_measurement
+from service.twin.photographs.readings import load_readings
 
 
 def read_observations(folder: MeasurementFolder, heliostat: str) -> list[Observation]:

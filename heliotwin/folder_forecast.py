@@ -31,13 +31,13 @@ from service.sources.folder import MeasuredSurface, MeasurementFolder, points_of
 from service.sources.photograph import CENTERED_WINDOW
 from service.store.tables import NO_IMAGE, MeasurementRow
 from service.twin import operations
-from service.twin.calibration import motors_of
 from service.twin.measurements import (
     AcceptedMeasurement,
     HeliostatContext,
     accepted_measurement,
     spot_position,
 )
+from service.twin.photographs.readings import motors_of
 from service.twin.stored_mount import load_mount
 
 Array = NDArray[np.float64]

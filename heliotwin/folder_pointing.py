@@ -18,7 +18,8 @@ from service.base.errors import SKIPPED, list_reasons
 from service.base.progress import Progress, no_progress
 from service.sources.folder import MeasurementFolder
 from service.store.tables import MeasurementRow
-from service.twin.calibration import calibrate_store, motors_of
+from service.twin.calibration import calibrate_store
+from service.twin.photographs.readings import motors_of
 from service.twin.stored_mount import StoredMount, load_mount
 
 

@@ -6,6 +6,7 @@ likely if the changed measurement fits the mount.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,10 @@ Array = NDArray[np.float64]
 _FITS = 3e-3
 _EXPLAINS = 0.15
 
-# Smallest error [rad] at which other heliostats are tried, and their number.
-_OTHER_SPOT = 10e-3
+OTHER_SPOT = 10e-3
+"""Smallest error [rad] at which other heliostats are tried."""
+
+# Number of other heliostats whose drives are looked at.
 _N_OTHERS = 4
 
 # Time zones and summer time differ by whole or half hours.
@@ -37,11 +40,13 @@ class Contradiction:
     """An excluded measurement: ``reason`` is a short code, ``detail`` a sentence.
 
     ``error_mrad`` [mrad] is the angle between its spot and the forecast one, from the mirror.
+    ``other`` is the heliostat that it fits, where that is the reason.
     """
 
     reason: str
     detail: str
     error_mrad: float
+    other: str | None = None
 
 
 def pointing_error(
@@ -90,25 +95,26 @@ class ContradictionClassifier:
             return Contradiction(
                 "motors", "its drives cannot reach the reported motor positions", 1e3 * np.pi
             )
-        fits = {
-            (code, detail): float(pointing_error(heliostat, mount, [other])[0])
-            for code, detail, other in _alternatives(reading, self._targets, self._site)
-        }
-        if error > _OTHER_SPOT:
-            fits |= self._other_heliostats(name, reading)
-        (code, detail), left = min(
-            fits.items(), key=lambda item: item[1], default=(("", ""), np.inf)
-        )
+        fits: list[tuple[float, str, str, str | None]] = [
+            (float(pointing_error(heliostat, mount, [changed])[0]), code, detail, None)
+            for code, detail, changed in _alternatives(reading, self._targets, self._site)
+        ]
+        if error > OTHER_SPOT:
+            fits += [
+                (left, "wrong_heliostat", f"it fits heliostat {other}", other)
+                for other, left in self._other_heliostats(name, reading).items()
+            ]
+        left, code, detail, other = min(fits, default=(np.inf, "", "", None), key=itemgetter(0))
         if left < max(_FITS, _EXPLAINS * error) and left < error / 2:
-            return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * error)
+            return Contradiction(code, f"{detail}, to {1e3 * left:.1f} mrad", 1e3 * error, other)
         return _unexplained(heliostat, mount, reading, self._targets, 1e3 * error)
 
-    def _other_heliostats(self, name: str, reading: Reading) -> dict[tuple[str, str], float]:
-        """Return the errors [rad] of a reading at the heliostats that it fits best."""
+    def _other_heliostats(self, name: str, reading: Reading) -> dict[str, float]:
+        """Return the errors [rad] of a reading at the heliostats that it fits best, by name."""
         count = len(self._measured)
         copies = pad_readings([[reading]] * count)
         apart = residuals(self._chain, copies, self._newest, np.zeros((count, 1, 2))).values[:, 0]
-        found = {}
+        found = dict[str, float]()
         for place in np.argsort(np.linalg.norm(apart, axis=-1))[:_N_OTHERS]:
             other = self._measured[place]
             if other == name:
@@ -119,7 +125,7 @@ class ContradictionClassifier:
                 )
             except ModelError:  # the drives of that heliostat cannot get there
                 continue
-            found["wrong_heliostat", f"it fits heliostat {other}"] = left
+            found[other] = left
         return found
 
 

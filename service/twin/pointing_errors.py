@@ -23,8 +23,8 @@ from model.times import format_minute
 from service import store
 from service.base.errors import ServiceError
 from service.store import mounts
-from service.store.tables import HeliostatRow, MountRow
-from service.twin.calibration import load_readings
+from service.store.tables import UNLIKE_HELIOSTAT, HeliostatRow, MountRow
+from service.twin.photographs.readings import load_readings
 from service.twin.runtime import Runtime
 from service.twin.stored_mount import StoredMount, stored_mount
 from service.twin.surfaces.accuracy import result_key
@@ -140,9 +140,13 @@ def pointing_state(
         calibrated, trend = len(days), _trend(apart)
         days, off = np.concatenate([days, [one.day for one in newer]]), np.append(off, apart)
         logs = np.log(np.maximum(off, 1e-3)).tolist()
-        for change in find_changes([moment_of(day) for day in days], logs, _LOG_RAYLEIGH):
-            is_far = far[max(change.first - calibrated, 0) :]
-            if change.first >= calibrated and change.max_drop < 0 and np.median(is_far) > 0:
+        changes = find_changes([moment_of(day) for day in days], logs, _LOG_RAYLEIGH)
+        newest = changes[-1].first if changes else 0
+        if changes and np.median(far[max(newest - calibrated, 0) :]) == 0:
+            is_own = np.append(np.ones(calibrated, dtype=bool), ~far)  # the spots came back
+            days, off, changes = days[is_own], off[is_own], []
+        for change in changes:
+            if change.first >= calibrated and change.max_drop < 0:
                 size = float(np.median(off[change.first :]))
                 moved = DriveStep(change.since, change.until, size, False)
                 days, off = days[change.first :], off[change.first :]
@@ -260,7 +264,9 @@ def _newer(
         None if newest is None else datetime.fromisoformat(newest) + timedelta(seconds=1)
     )  # times are stored to the second
     rows = [
-        one for one in mounts.pointing_measurements(session, row, since) if one.taken_at is not None
+        one
+        for one in mounts.pointing_measurements(session, row, since)
+        if one.taken_at is not None and one.warning(UNLIKE_HELIOSTAT) is None
     ]
     targets = {one.name: store.target_plane(one) for one in store.list_targets(session)}
     readings, _ = load_readings(stored.heliostat, rows, stored.model, targets)

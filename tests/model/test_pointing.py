@@ -440,6 +440,7 @@ def test_contradictions_are_named(world):
     }
     assert "1 h earlier" in named["10"].detail
     assert "H07" in named["15"].detail
+    assert {name: one.other for name, one in named.items() if one.other} == {"15": "H07"}
     listed = field_to_json(done, {})["heliostats"]["H06"]["outliers"]
     assert {name: one["off_mrad"] for name, one in listed.items()} == {
         name: round(one.error_mrad, 2) for name, one in named.items()

@@ -1,6 +1,7 @@
-"""Detect on arrival whether a photograph fits another heliostat's surface much better.
+"""Detect on arrival whether a photograph fits another heliostat much better.
 
-The limits were measured on real photographs: ``python -m benchmarks.swaps``.
+Its motors say so, or its flux. The limits of accuracy were measured on real photographs: ``python
+-m benchmarks.swaps``.
 """
 
 import logging
@@ -11,15 +12,19 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from model.errors import ModelError
 from model.metrics import flux_accuracy
+from model.plant import TargetPlane
+from model.pointing.reasons import OTHER_SPOT, ContradictionClassifier, pointing_error
+from service import store
 from service.base.arrays import unpack
-from service.base.errors import ServiceError
+from service.base.errors import ConflictError, ServiceError
 from service.store import mounts
 from service.store.surface_versions import current_surfaces
 from service.store.tables import UNLIKE_HELIOSTAT, HeliostatRow, MeasurementRow, SurfaceRow
 from service.twin.measurements import AcceptedMeasurement, Array, HeliostatContext
 from service.twin.photographs.metadata import Warnings
+from service.twin.photographs.readings import reading_of
 from service.twin.runtime import Runtime
-from service.twin.stored_mount import as_calibrated
+from service.twin.stored_mount import as_calibrated, mount_at, mount_of, with_drive_zeros
 from service.twin.surfaces.accuracy import usual_accuracy
 
 logger = logging.getLogger("heliotwin.service")
@@ -88,6 +93,9 @@ def unlike_warnings(
         with runtime.database.reading() as session:
             if not is_suspicious(accuracy, usual_accuracy(session, twin.row.id)):
                 return []
+            like = _like_by_motors(session, twin, photograph, measurement.target)
+            if like is not None:
+                return [_warning(f"unlike {name}, like {like}: its motors fit that one", like)]
             candidates = _candidates(session, twin, photograph)
         others = _accuracies(runtime, candidates, measurement)
     except (ModelError, ServiceError) as error:
@@ -100,7 +108,39 @@ def unlike_warnings(
     if like is None:
         return []
     detail = f"unlike {name}, like {like} (accuracy {accuracy:.2f} against {others[like]:.2f})"
-    return [{"type": UNLIKE_HELIOSTAT, "detail": detail, "like": like}]
+    return [_warning(detail, like)]
+
+
+def _warning(detail: str, like: str) -> dict[str, object]:
+    return {"type": UNLIKE_HELIOSTAT, "detail": detail, "like": like}
+
+
+def _like_by_motors(
+    session: Session, twin: HeliostatContext, photograph: MeasurementRow, plane: TargetPlane
+) -> str | None:
+    """The heliostat that directs its light to the spot with these motors, where this one does not.
+
+    None without motors and a calibrated mount, or if another reason explains the spot as well.
+    """
+    own = mount_at(session, twin.row)
+    if own is None:
+        return None
+    targets = {row.name: store.target_plane(row) for row in store.list_targets(session)}
+    try:
+        reading = reading_of(own.heliostat, photograph, own.model, plane, targets.values())
+        if pointing_error(own.heliostat, own.mount, [reading])[0] < OTHER_SPOT:
+            return None
+    except ModelError:  # nothing says where its light should be
+        return None
+    heliostats, calibrated = {}, {}
+    for row, mount in mounts.current_mounts(session):
+        try:
+            calibrated[row.name] = mount_of(row, mount, own.model.effects)
+        except ConflictError:  # to be calibrated again
+            continue
+        heliostats[row.name] = with_drive_zeros(row, own.model.site.origin)
+    classifier = ContradictionClassifier(heliostats, calibrated, targets, own.model.site)
+    return classifier.classify(twin.row.name, reading).other
 
 
 def _candidates(

@@ -152,9 +152,7 @@ class WarningOut(BaseModel):
     )
     like: str | None = Field(
         default=None,
-        description=(
-            "The heliostat whose surface forecasts the photograph much better, of that type."
-        ),
+        description="The heliostat that explains the photograph much better, of that type.",
     )
 
 

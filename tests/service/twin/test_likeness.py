@@ -16,7 +16,9 @@ from sqlalchemy import URL
 from model.errors import UnreachableError
 from service.base.errors import BusyError
 from service.base.settings import Settings
+from service.twin.calibration import calibrate_store, store_mounts
 from service.twin.photographs.likeness import CANDIDATES, find_like, is_suspicious
+from service.twin.runtime import Runtime
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
@@ -29,6 +31,7 @@ from tests.service.conftest import (
     sun_at,
     tower_document,
 )
+from tests.service.spots import photographs
 
 HTML = {"Accept": "text/html"}
 
@@ -145,7 +148,31 @@ def test_a_photograph_that_fits_another_heliostat_is_warned_of(
     listed = client.get("/photographs?warned=true&heliostat=H00", headers=HTML).text
     assert "like H02" in listed
     (item,) = client.get("/v1/alarms?reason=unlike_heliostat").json()["items"]
-    assert item["message"] == "1 measurement that another heliostat's surface forecasts much better"
+    assert item["message"] == "1 measurement that another heliostat explains much better"
+
+
+def test_motors_that_fit_another_heliostat_name_it(
+    field_of_twelve: TestClient, fitting: Likenesses
+):
+    """No surface fits much better, but the motors direct the light of another one to the spot."""
+    client, taken = field_of_twelve, dict[str, list[dict[str, Any]]]()
+    for number, name in ((2, "H02"), (4, "H04")):
+        properties = properties_document()
+        properties["heliostat_position"][1] += 1e-4 * number
+        taken[name] = photographs(tower_document(), properties)
+        for place, one in enumerate(taken[name][:14]):
+            dated = {"taken_at": f"2024-05-{place + 13:02d}T11:00:00Z", "id": f"{name}-{place}"}
+            post(client, name, 100 * number + place, **one | dated)
+    runtime: Runtime = client.app.state.runtime  # type: ignore[attr-defined]
+    done = calibrate_store(runtime, list(taken))
+    with runtime.database.writing() as session:
+        assert store_mounts(session, done).keys() == taken.keys()
+    fitting.accuracies = {f"H{number:02d}": 0.6 for number in range(12)}
+    later = {"taken_at": "2024-06-02T12:00:00Z"}
+    own, others = (taken[name][15] | later for name in ("H02", "H04"))
+    assert unlike(post(client, "H02", 300, **own | {"id": "own"})) == []
+    (warning,) = unlike(post(client, "H02", 301, **others | {"id": "others"}))
+    assert warning["detail"] == "unlike H02, like H04: its motors fit that one"
 
 
 def test_the_warning_holds_until_sun_or_target_change(

@@ -120,6 +120,23 @@ def test_move_since_the_calibration_is_reported_with_its_dates(
     )
 
 
+def test_spots_that_came_back_are_no_move(
+    client: TestClient, post: Post, tower: Any, properties: Any
+):
+    """As those of photographs that show another heliostat."""
+    as_ever, moved = photographs(tower, properties), photographs(tower, properties, 25.0)
+    taken = [*as_ever[:8], *moved[8:12], *as_ever[12:]]
+    for number, one in enumerate(taken):
+        if number == 8:
+            calibrate(client)
+        assert post(png(number), **one).status_code == 201
+        is_away = number in (10, 11)
+        if number >= 8:
+            assert (client.get(PATH).json()["moved"] is not None) >= is_away, number
+    answer = client.get(PATH).json()
+    assert (answer["moved"], answer["error_mrad"] < 2) == (None, True)
+
+
 @pytest.mark.full
 def test_photographs_without_a_time_say_of_no_move(
     client: TestClient, post: Post, tower: Any, properties: Any
