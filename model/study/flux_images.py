@@ -52,6 +52,9 @@ class FluxImage:
     seen : bool
         Whether the mirror's surface was predicted from it: such a surface flatters its own
         photographs.
+    is_estimated : bool
+        Whether the mirror's surface is an estimate from photographs: what it leaves of their error
+        is no effect's.
     clipped : bool (rows, columns) or None
         Saturated pixels, None if there are none.
     sheet_share : float [1]
@@ -70,6 +73,7 @@ class FluxImage:
     setup: Setup
     image: NDArray[np.floating]
     seen: bool = False
+    is_estimated: bool = False
     clipped: NDArray[np.bool_] | None = None
     sheet_share: float = 0.0
     spot_std_rad: float = USUAL_RAD

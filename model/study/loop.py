@@ -12,7 +12,6 @@ from model.plant_model import PlantModel
 from model.study.discrepancy import find_discrepancy
 from model.study.flux_images import FluxImage, without_hot_pixels
 from model.study.halves import find_drifts
-from model.study.judging import paired_gain
 from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
 from model.study.parameters import Term
 from model.study.scope_search import ScopeSearch
@@ -206,10 +205,13 @@ def _contradict(
     least = MIN_RIVAL * outcome.excess_error
     if outcome.leaves_little and outcome.has_unexplained_error:
         added = find_discrepancy(fitter, current, outcome.noise_floor, max_terms=1)
-        if added is not None and added.gain.mean >= least:
+        if (
+            added is not None
+            and outcome.reference.gain(added.accuracy - current.accuracy).mean >= least
+        ):
             reasons.append(f"{added.described} gains more")
     if outcome.leaves_little and discrepancy is not None:
-        change = paired_gain(discrepancy.accuracy - current.accuracy, fitter.judged_heliostats)
+        change = outcome.reference.gain(discrepancy.accuracy - current.accuracy)
         if change.low > 0 and change.mean >= least:
             reasons.append(f"{discrepancy.described} alone gains more")
         elif change.mean >= -least and n_unknown >= FEWER * discrepancy.n_coefficients:

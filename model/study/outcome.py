@@ -14,7 +14,7 @@ from model.metrics import flux_accuracies
 from model.site import Site
 from model.study.discrepancy import Discrepancy
 from model.study.flux_images import FluxImage, noise_floor
-from model.study.judging import BeforeAfter, Gain
+from model.study.judging import BeforeAfter, Gain, paired_gain
 from model.study.parameters import ParameterVector, Term
 from model.study.pattern import Pattern, pattern_of
 from model.study.position import EXPECTED, NAT, is_known, loss
@@ -37,6 +37,9 @@ together imitate nearly anything: of pure light such imitations leave 0.26 and m
 
 MIN_RIVAL = 0.1
 """Smallest share of that error that a generic term must gain to contradict the effects found."""
+
+MIN_REFERENCE = 8
+"""Smallest number of images of estimated surfaces, without the effects found, as a reference."""
 
 SHARED = 0.02
 """Standard deviation of the error that all images share, in shares of a parameter's distance from
@@ -154,6 +157,41 @@ def _listed(names: Sequence[str]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
+class Reference:
+    """What errors are compared with.
+
+    Attributes
+    ----------
+    heliostats : (H,)
+        Of the held-out images.
+    free : bool (H,) or None
+        Images on which no effect acts that was found: they show what estimated surfaces leave. None
+        for exact surfaces, and below `MIN_REFERENCE` such images: then it is no error.
+    """
+
+    heliostats: NDArray[np.str_]
+    free: NDArray[np.bool_] | None
+
+    @classmethod
+    def of(cls, images: Sequence[FluxImage], effects: Sequence[Effect]) -> "Reference":
+        """The reference of images with the effects that were found."""
+        names = np.array([one.heliostat for one in images])
+        acts = [[e.at(p.taken_at, p.heliostat) is not None for e in effects] for p in images]
+        free = ~np.any(acts, axis=1)
+        is_shown = all(one.is_estimated for one in images) and free.sum() >= MIN_REFERENCE
+        return cls(names, free if is_shown and not free.all() else None)
+
+    def beyond(self, values: Array) -> Array:
+        """Values (H,) where effects act, less the mean of the others; all without others."""
+        return values if self.free is None else values[~self.free] - values[self.free].mean()
+
+    def gain(self, changes: Array) -> Gain:
+        """The gain by changes of accuracy (H,), beyond that of the others."""
+        names = self.heliostats if self.free is None else self.heliostats[~self.free]
+        return paired_gain(self.beyond(changes), names)
+
+
+@dataclass(frozen=True, eq=False)
 class Study:
     """The outcome of a study.
 
@@ -226,6 +264,11 @@ class Study:
         """Mean error that the images' noise and the sheets behind the spots make alone."""
         return noise_floor(self.images, self.window)
 
+    @cached_property
+    def reference(self) -> "Reference":
+        """What errors are compared with."""
+        return Reference.of(self.images, self.effects)
+
     @property
     def unexplained_share(self) -> float:
         """Share of the error beyond noise that the effects found leave; zero if it is small."""
@@ -243,12 +286,13 @@ class Study:
 
     def _excess_error(self, accuracy: Array, position_residuals: Array) -> float:
         """Mean error beyond noise, of shape and of position."""
-        of_position = loss(position_residuals) - EXPECTED * self.has_position
+        of_position = self.reference.beyond(loss(position_residuals) - EXPECTED * self.has_position)
         return self._shape_error(accuracy) + max(0.0, NAT * float(of_position.mean()))
 
     def _shape_error(self, accuracy: Array) -> float:
         """Mean error of shape beyond noise."""
-        return max(0.0, 1 - float(accuracy.mean()) - self.noise_floor)
+        noise = self.noise_floor if self.reference.free is None else 0.0
+        return max(0.0, float(self.reference.beyond(1 - accuracy).mean()) - noise)
 
     @property
     def leaves_little(self) -> bool:
@@ -291,11 +335,6 @@ class Study:
         left = self._error_left
         # The mean magnitude of deviations is 0.8 of their standard deviation.
         return left > 0 and self.pattern.is_targets and 0.8 * self.pattern.depth >= left / 2
-
-    @property
-    def n_in_sample(self) -> int:
-        """Number of the images here that surfaces were predicted from."""
-        return sum(p.seen for p in self.images)
 
     @property
     def has_unexplained_error(self) -> bool:

@@ -24,13 +24,18 @@ def conclude(study: Study) -> str:
             f" Hot or dead pixels have {hot_share:.1%} of the light; the study took them"
             " from their neighbours. Repair or mask them in the camera."
         )
-    if not study.n_in_sample:
+    if not (seen := _n_in_sample(study)):
         return conclusion
     return (
-        f"{conclusion} {study.n_in_sample} of the {len(study.images)} images that judge are among"
+        f"{conclusion} {seen} of the {len(study.images)} images that judge are among"
         " those that the surfaces were predicted from, which flatters both accuracies: predict from"
         " fewer, or take more."
     )
+
+
+def _n_in_sample(study: Study) -> int:
+    """Number of the images that judge and that surfaces were predicted from."""
+    return sum(image.seen for image in study.images)
 
 
 def _verdict_in_words(study: Study) -> str:
@@ -102,7 +107,7 @@ def study_to_json(study: Study) -> dict[str, Any]:
         "images": {
             "fit": study.n_fitted,
             "held_out": len(study.images),
-            **({"held_out_but_predicted_from": study.n_in_sample} if study.n_in_sample else {}),
+            **({"held_out_but_predicted_from": seen} if (seen := _n_in_sample(study)) else {}),
             **({"held_out_with_motors": n_with_motors} if n_with_motors else {}),
         },
         "window_m": study.window,

@@ -121,12 +121,17 @@ class AcceptedMeasurement:
         return share_window(self.clipped, size, self.target.to_plane(self.spot), side)
 
     def photograph(
-        self, heliostat: Heliostat, points: Array, degree: int = DEGREE, seen: bool = False
+        self,
+        heliostat: Heliostat,
+        points: Array,
+        degree: int = DEGREE,
+        seen: bool = False,
+        is_estimated: bool = False,
     ) -> FluxImage:
         """The flux image that a study compares with a mirror.
 
         ``points`` are the mirror's control points (F, I, J, 3) [m]. ``seen`` is whether the mirror
-        was computed from this photograph.
+        was computed from this photograph, ``is_estimated`` whether from any.
 
         Raises
         ------
@@ -159,6 +164,7 @@ class AcceptedMeasurement:
             shot,
             np.asarray(image, dtype=np.float64),
             seen=seen,
+            is_estimated=is_estimated,
             clipped=clipped,
             sheet_share=self.sheet_share,
         )

@@ -16,6 +16,7 @@ from model.effects.blocking import Blocking
 from model.effects.camera_blur import CameraBlur
 from model.effects.encoder_offset import EncoderOffset
 from model.effects.facet_canting import FacetCanting
+from model.effects.scope import Since
 from model.effects.slope_error import SlopeError
 from model.effects.sun_shape import SunShapeEffect
 from model.errors import InvalidInputError
@@ -32,6 +33,7 @@ from model.study.fitting import Fitter
 from model.study.flux_images import Forecaster, cut, in_pixels, spot_window, without_hot_pixels
 from model.study.judging import few_gain, paired_gain, rank_correlation, split
 from model.study.noise import grain_variance
+from model.study.outcome import Reference
 from model.study.parameters import ParameterVector, Term
 from model.study.position import whiten
 from model.study.report import error_covariates
@@ -431,6 +433,25 @@ def test_several_effects_must_leave_less_of_pure_light_than_one(hazy):
     several = replace(one, found=2 * one.found)
     on_sheet = replace(several, images=[replace(p, sheet_share=1e-3) for p in several.images])
     assert (one.verdict, several.verdict, on_sheet.verdict) == ("effect", "unexplained", "effect")
+
+
+@pytest.mark.parametrize("is_estimated", [True, False])
+def test_what_estimated_surfaces_leave_is_no_effects(hazy, is_estimated: bool):
+    """Twelve images without the effect are as wrong as those with it are then."""
+    begin = datetime(2026, 5, 13, tzinfo=UTC)
+    times = [begin + timedelta(days=day) for day in range(-12, 8)]
+    images = [
+        replace(hazy[0], is_estimated=is_estimated, setup=replace(hazy[0].setup, taken_at=at))
+        for at in times
+    ]
+    effect = SunShapeEffect(0.2, scope=Since(begin.date()))
+    error = np.array([0.03 + 0.05 * (at >= begin) for at in times])
+    reference = Reference.of(images, [effect])
+    left = reference.beyond(error)
+    assert (len(left), round(float(left.mean()), 6)) == ((8, 0.05) if is_estimated else (20, 0.05))
+    assert reference.gain(np.full(20, 0.02)).mean == pytest.approx(0.0 if is_estimated else 0.02)
+    everywhere = Reference.of(images, [SunShapeEffect(0.2)])  # nothing shows what surfaces leave
+    assert len(everywhere.beyond(error)) == 20
 
 
 def test_spots_that_are_off_do_not_speak_against_what_changed_shapes(hazy):

@@ -276,8 +276,9 @@ def add_photographs(
     """Add photographs of a heliostat whose mirror has the control ``points`` (F, I, J, 3) [m].
 
     ``rows`` are accepted photographs, loaded with their arrays. ``seen`` are identifiers of those
-    that the mirror was computed from. A photograph that is newer than the calibration of its mount
-    also has the pointing from its motors. Mirrors near the heliostat may hide parts of it.
+    that the mirror was estimated from, if it was. A photograph that is newer than the calibration
+    of its mount also has the pointing from its motors. Mirrors near the heliostat may hide parts of
+    it.
     """
     stored, neighbours = mount_at(session, twin.row), load_neighbours(session, twin)
     for row in rows:
@@ -285,7 +286,7 @@ def add_photographs(
             _require_on_target(twin, row)
             evidence = accepted_measurement(row, twin.origin)
             photograph = evidence.photograph(
-                twin.heliostat, points, degree, seen=row.identifier in seen
+                twin.heliostat, points, degree, row.identifier in seen, bool(seen)
             )
             if stored is not None:
                 motors, day = evidence.motor_position, day_of(evidence.taken_at)
