@@ -17,7 +17,6 @@ Friedman, *The Elements of Statistical Learning* (2009), sections 3.4.1 and 7.10
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,6 +76,9 @@ MIN_VARIED = 0.1
 LOCATED = 0.2
 """Largest share of the excess error that may stay unexplained where a discrepancy is located."""
 
+
+ROUGHLY = 0.25
+"""Share of the least gain that a further term must have in the linear model to be fitted."""
 
 MIN_RIVALRY = 0.5
 """Smallest share of the best term's gain with which another term is its rival."""
@@ -249,6 +251,13 @@ class Rival:
             "gain_share": round(self.gain_share, 3),
             "distinguished_by": self.photographs,
         }
+
+
+class TermGain(NamedTuple):
+    """A term, and its gain in cross-validation."""
+
+    term: GenericTerm
+    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -523,11 +532,12 @@ class _Search(_Sample):
         left = regression.left_without(self.folds[self.is_fitted], ridge)
         return self.accuracy(left, self.is_fitted)
 
-    def best(self, cuts: Array) -> TermChoice:
+    def best(self, cuts: Array, least: float = -np.inf) -> TermChoice:
         """The simplest of the best terms.
 
-        All are compared in the linear model of their kind. Then the best term of each of the best
-        kinds is fitted by Gauss-Newton, for strong changes of mirrors are not linear.
+        All are compared in the linear model of their kind. If one gains ``least`` there, the best
+        term of each of the best kinds is fitted by Gauss-Newton, for strong changes of mirrors are
+        not linear.
         """
         before = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
 
@@ -541,18 +551,22 @@ class _Search(_Sample):
                 for term, ridge in pairs
             ]
 
-        by_kind = [
-            choices(self.terms(kind), self.linearise(kind, cuts), RIDGES[1:2])
-            for kind in self.model.kinds
-        ]
-        simplest = (self.simplest(own, SIMPLER_LINEAR) for own in by_kind)
-        screened = sorted(simplest, key=lambda one: -one.gain)
+        screened: list[TermChoice] = []  # only their linear models stay in memory
+        gains: list[TermGain] = []
+        for kind in self.model.kinds:
+            own = choices(self.terms(kind), self.linearise(kind, cuts), RIDGES[1:2])
+            gains += [TermGain(one.term, one.gain) for one in own]
+            screened.append(self.simplest(own, SIMPLER_LINEAR))
+            screened = sorted(screened, key=lambda one: -one.gain)[:SCREENED]
+        if screened[0].gain < least:
+            return screened[0]
         finalists: list[TermChoice] = []
-        for one in screened[:SCREENED]:
+        for one in screened:
             point = self.iterate(one.term, one.ridge, cuts, one.point).point
             finalists += choices([one.term], point, RIDGES)
         chosen = self.simplest(finalists, SIMPLER)
-        others = sorted([*finalists, *chain(*by_kind)], key=lambda one: -one.gain)
+        gains += [TermGain(one.term, one.gain) for one in finalists]
+        others = sorted(gains, key=lambda one: -one.gain)
         return replace(chosen, rival=find_rival(self, chosen, others))
 
     def linearise(self, kind: GenericKind, cuts: Array) -> Linearised:
@@ -600,7 +614,7 @@ class _Search(_Sample):
         return BeforeAfter(self.accuracy(before), self.accuracy(left))
 
 
-def find_rival(search: _Search, best: TermChoice, others: Sequence[TermChoice]) -> Rival | None:
+def find_rival(search: _Search, best: TermChoice, others: Sequence[TermGain]) -> Rival | None:
     """The best of ``others``, the best first, that competes; None if it gains little."""
     other = next(one for one in others if one.term.competes_with(best.term))
     if other.gain < MIN_RIVALRY * best.gain:
@@ -641,9 +655,10 @@ def find_discrepancy(
     cuts, held_out = search.model.cuts, fitter.split.held_out
     excess = 1 - noise - float(base.accuracy.mean())
     found: list[FittedTerm] = []
+    least = max(MIN_SHARE * excess, fitter.options.min_gain)
     for _ in range(max_terms):
-        choice = search.best(cuts)
-        if choice.gain < max(MIN_SHARE * excess, fitter.options.min_gain):
+        choice = search.best(cuts, ROUGHLY * least if found else -np.inf)
+        if choice.gain < least:
             break
         found.append(search.fit(choice, cuts))
         cuts = found[-1].cuts
