@@ -350,6 +350,7 @@ _BETWEEN = re.compile(r"between (\S+ \S+) UTC and (\S+ \S+) UTC")
 _DATED = {
     "facet canted": "fell",
     "camera changed": "fell",
+    "hazy": "fell",
     "soiled": "dimmed",
     "drives stepped": "moved",
     "target moved": "moved",
@@ -359,7 +360,8 @@ _DATED = {
 def dates(client: TestClient, case: Case) -> list[bool]:
     """Whether the interval of each dated alarm holds the first photograph after a change.
 
-    Two faults may move the spots of a heliostat, such as its drives and the target.
+    Two faults may move the spots of a heliostat, such as its drives and the target. What falls in
+    the whole field has a fault of the field.
     """
     found = []
     for alarm in client.get("/v1/alarms", params={"limit": 500}).json()["items"]:
@@ -378,12 +380,12 @@ def dates(client: TestClient, case: Case) -> list[bool]:
     return found
 
 
-def first_of(case: Case, fault: Fault, name: str) -> datetime:
-    """When the first photograph of a heliostat was taken that a fault acts on."""
+def first_of(case: Case, fault: Fault, name: str | None) -> datetime:
+    """When the first photograph of a heliostat, or of any, was taken that a fault acts on."""
     return min(
         one.taken_at
         for one in case.photographs
-        if fault.kind in one.faults and one.mirror.name == name
+        if fault.kind in one.faults and name in (None, one.mirror.name)
     )
 
 

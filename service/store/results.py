@@ -203,9 +203,10 @@ class Studied(NamedTuple):
     last_taken_at: datetime | None
 
 
-def list_studied(session: Session) -> list[Studied]:
-    """What each study was of, the oldest first."""
+def list_studied(session: Session, model: int) -> list[Studied]:
+    """What each study with a version of the model was of, the oldest first."""
     query = select(StudyRow.heliostats, StudyRow.last_taken_at).order_by(StudyRow.id)
+    query = query.where(StudyRow.model == model)
     return [Studied(names, last) for names, last in session.execute(query)]
 
 

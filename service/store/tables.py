@@ -454,6 +454,8 @@ class FieldStateRow(Base):
     - ``marks`` are the newest rows behind the alarms (`service.twin.alarms.field_overview`).
     - ``pending`` heliostats had no valid results then.
     - ``cameras`` are `service.twin.studies.cameras.CameraChange`.
+    - ``levels`` [1] of the accuracy are by the times of the days' last photographs
+      (`service.twin.alarms.field_fall`).
     - ``pointing_limit_mrad`` is the limit of the settings behind the pointing of all heliostats.
     """
 
@@ -467,6 +469,7 @@ class FieldStateRow(Base):
     marks: Mapped[str] = mapped_column(Text, default="")
     pending: Mapped[int] = mapped_column(default=0)
     cameras: Mapped[list[dict[str, object]]] = mapped_column(default=list)
+    levels: Mapped[dict[str, float] | None]
     pointing_limit_mrad: Mapped[float | None]
 
 

@@ -87,11 +87,12 @@ def open_questions(findings: StudyFindings) -> list[OpenQuestion]:
 def is_ambiguous(findings: StudyFindings) -> bool:
     """Whether an effect looks like another one that changes forecasts for receivers otherwise.
 
-    Of two that only images of targets show, either will do.
+    Of two that only images of targets show, either will do, and of two that ended.
     """
     return any(
         not (_is_of_images(effect["name"]) and _is_of_images(other))
         for effect in findings.effects
+        if not (effect.get("scope") or {}).get("until")
         for other in effect.get("lookalikes", ())
     )
 

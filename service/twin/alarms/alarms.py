@@ -47,6 +47,7 @@ from service.store.tables import (
 )
 from service.twin import model_versions
 from service.twin.alarms import offers
+from service.twin.alarms.field_fall import LEAST, find_field_fall
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
 from service.twin.alarms.measured_states import LostLight, find_lost_light, measure_states
 from service.twin.alarms.offers import Offer
@@ -187,10 +188,11 @@ def compute_alarms(
     settings: Settings,
     cameras: CameraReadings,
     effects: EffectFindings,
+    levels: Mapping[str, float],
 ) -> list[Alarm]:
     """Compute the alarms of the plant, its cameras, its model and its heliostats.
 
-    They are acknowledged only as surfaces are.
+    They are acknowledged only as surfaces are. ``levels`` are those of the field's accuracy.
     """
     at, zone = now(), plant_time_zone(session, settings.time_zone)
     lost = find_lost_light(cameras.light, settings.alarm_light_loss)
@@ -202,12 +204,13 @@ def compute_alarms(
         *_clock(session),
         *_ended_effects(session, effects),
         *_undecided(effects.adoptable),
+        *_fallen_together(session, levels),
     ]
     found += _accuracies(session, settings)
     found += _without_photograph(session, timedelta(days=settings.alarm_photograph_days), at)
     found += [*_warned(session), *_dimmed(session, lost, settings)]
     for line in lines:
-        found += _of_heliostat(line, settings, at)
+        found += _of_heliostat(line, settings, at, levels)
     return found
 
 
@@ -215,10 +218,12 @@ def compute_alarms(
 # --------------------------------------------------------------------------------------------------
 
 
-def _of_heliostat(line: HeliostatOverview, settings: Settings, at: datetime) -> Iterator[Alarm]:
+def _of_heliostat(
+    line: HeliostatOverview, settings: Settings, at: datetime, levels: Mapping[str, float]
+) -> Iterator[Alarm]:
     if (untrusted := find_untrusted(line, at)) is not None:
         yield untrusted
-    yield from _fallen(line, settings)
+    yield from _fallen(line, settings, levels)
     if line.pointing is not None:
         yield from _pointing(line, line.pointing, settings, at)
 
@@ -349,7 +354,7 @@ def _times_unknown(name: str, count: int, first: datetime) -> Alarm:
 _WARNED: dict[Reason, tuple[str, str, str]] = {
     "unlike_heliostat": (
         UNLIKE_HELIOSTAT,
-        "that another heliostat's surface forecasts much better",
+        "that another heliostat explains much better",
         "delete what was sent by mistake, and send it for its heliostat; or look at the mirror",
     ),
     "sun_contradicts_time": (
@@ -458,10 +463,12 @@ def find_ended_accuracies(
                 begun = None
 
 
-def _fallen(line: HeliostatOverview, settings: Settings) -> Iterator[Alarm]:
-    """Report a heliostat whose photographs are forecast worse since a change."""
+def _fallen(
+    line: HeliostatOverview, settings: Settings, levels: Mapping[str, float]
+) -> Iterator[Alarm]:
+    """Report a heliostat whose photographs are worse since a change, by more than the field's."""
     fall, allowed = line.fall, settings.alarm_accuracy_drop
-    if fall is None or fall.min_drop <= allowed:
+    if fall is None or fall.min_drop - fall.of_field(levels) <= allowed:
         return
     message = (
         f"its accuracy fell {fall.when}: photographs since are forecast with {fall.recent:.0%},"
@@ -471,6 +478,25 @@ def _fallen(line: HeliostatOverview, settings: Settings) -> Iterator[Alarm]:
     action = "look for what changed, and predict its surface from photographs since then"
     size = fall.min_drop / max(allowed, 1e-6)
     yield Alarm("fell", line.name, fall.until, message, action, _fingerprint(fall.until, size))
+
+
+def _fallen_together(session: Session, levels: Mapping[str, float]) -> Iterator[Alarm]:
+    """Report that the photographs of the whole field are forecast worse since a change."""
+    fall = find_field_fall(levels)
+    if fall is None:
+        return
+    drop = fall.earlier - fall.recent
+    studies = store.list_studied(session, model_versions.current_number(session))
+    yield Alarm(
+        "fell",
+        None,
+        fall.until,
+        f"the accuracy of the whole field fell {fall.when}, by {100 * drop:.1f} points in the"
+        " median of its heliostats",
+        "look for haze, a changed camera or a moved target, and study the photographs",
+        _fingerprint(fall.until, drop / LEAST),
+        offer=None if offers.has_seen(studies, fall.until) else offers.study(None, fall.until),
+    )
 
 
 def _dimmed(
@@ -581,7 +607,8 @@ def _camera(session: Session) -> Iterator[Alarm]:
 def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alarm]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
-    studies = store.list_studied(session) if cameras else []
+    current = model_versions.current_number(session)
+    studies = store.list_studied(session, current) if cameras else []
     for change in cameras:
         since = datetime.combine(change.day, clock(), ZoneInfo(zone)).astimezone(UTC)
         if declared is None or since > declared.adopted_at:

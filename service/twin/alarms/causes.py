@@ -402,8 +402,8 @@ def _foreign_light(facts: HeliostatFacts, poor: Mapping[str, str]) -> list[Likel
     if unlike:
         likes = sorted({str((one.warning(UNLIKE_HELIOSTAT) or {})["like"]) for one in unlike})
         said = (
-            f"the surface of {', '.join(likes)} forecasts {count_photographs(len(unlike))} of"
-            f" {len(facts.photographs)} much better"
+            f"{', '.join(likes)} explain{'s' if len(likes) == 1 else ''}"
+            f" {count_photographs(len(unlike))} of {len(facts.photographs)} much better"
         )
         return _of_photographs("foreign_light", unlike, poor, said)
     days, changed = set(_hazy_days(facts, poor)), facts.since_change()
@@ -592,7 +592,7 @@ def read_facts(
         epoch,
         alarms,
         adopting if study is not None else None,
-        store.list_studied(session),
+        store.list_studied(session, model_versions.current_number(session)),
         None if epoch is None else _confirming(session, row, epoch),
     )
 

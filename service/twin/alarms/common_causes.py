@@ -31,6 +31,7 @@ from service.store.tables import (
     ModelRow,
     TargetRow,
 )
+from service.twin import model_versions
 from service.twin.alarms import offers
 from service.twin.alarms.acknowledging import AlarmsTogether
 from service.twin.alarms.alarms import Alarm, AlarmId
@@ -51,6 +52,7 @@ _MOST_NAMES = 1000  # heliostats whose photographs are read
 _CAUSED: dict[Reason, tuple[Reason, ...]] = {
     "camera": ("accuracy", "fell", "untrusted", "unlike_heliostat"),
     "clock": ("moved", "pointing", "drift", "sun_contradicts_time"),
+    "fell": ("accuracy", "fell"),
 }
 """Reasons of the plant, with the reasons of heliostats that may follow from them."""
 
@@ -156,7 +158,7 @@ def _offer(session: Session, cause: CommonCause) -> Offer | None:
         names = {one.heliostat for one in cause.members if one.heliostat and one.offer}
         return offers.calibrate(sorted(names)) if names else None
     if reasons & {"accuracy", "fell"} and not offers.has_seen(
-        store.list_studied(session), cause.last_at
+        store.list_studied(session, model_versions.current_number(session)), cause.last_at
     ):
         return offers.study(cause.heliostats, cause.first_at)
     return None
@@ -237,7 +239,11 @@ def _evidence(
     reason, cause = burst[0].reason, CommonCause(burst, ())
     before = cause.first_at - _WINDOW
     for alarm in alarms:
-        if reason in _CAUSED.get(alarm.reason, ()) and before <= alarm.since <= cause.last_at:
+        if (
+            alarm.heliostat is None
+            and reason in _CAUSED.get(alarm.reason, ())
+            and before <= alarm.since <= cause.last_at
+        ):
             yield f"{REASONS[alarm.reason].label.lower()}: {alarm.message}"
     if reason in _BY_MODEL:
         yield from _models(session, before, cause.last_at)

@@ -24,6 +24,7 @@ from service.store.field_state import apply_pointing_limit, lock_field_state, sa
 from service.store.job_tables import AlarmRow, JobRow
 from service.store.tables import DecisionRow, MeasurementRow, ModelRow, MountRow, SurfaceRow
 from service.twin.alarms.alarms import RECORDED, Alarm, compute_alarms, find_ended_accuracies
+from service.twin.alarms.field_fall import are_known, read_levels
 from service.twin.alarms.field_overview import (
     LARGE,
     HeliostatOverview,
@@ -57,6 +58,7 @@ class _Reading(NamedTuple):
     marks: str
     lines: list[HeliostatOverview]
     cameras: list[CameraChange]
+    levels: dict[str, float]
     alarms: list[Alarm]
 
     @property
@@ -129,8 +131,9 @@ class FieldStateWriter:
                 read_marks(session),
             )
             lines, cameras = read_summaries(session), self._watch.read(session, settings)
-            alarms = compute_alarms(session, lines, settings, cameras, effects)
-        return _Reading(revision, at, marks, lines, cameras.changes, alarms)
+            levels = read_levels(session, lines)
+            alarms = compute_alarms(session, lines, settings, cameras, effects, levels)
+        return _Reading(revision, at, marks, lines, cameras.changes, levels, alarms)
 
     def _compute(
         self, pending: Sequence[HeliostatOverview], seconds: float, stopping: threading.Event
@@ -165,6 +168,8 @@ def _write(session: Session, reading: _Reading, settings: Settings) -> None:
         line = lines.get(key.heliostat or "")
         if line is not None and _BY_RESULT.get(key.reason) in line.pending:
             return None
+        if line is None and key.reason == "fell" and not are_known(reading.lines):
+            return None
         if (at := ends.get((key.heliostat, key.reason, row.since))) is not None:
             return at
         if line is None:
@@ -182,6 +187,7 @@ def _write(session: Session, reading: _Reading, settings: Settings) -> None:
     acknowledgements.record_ended(session, brief)
     field.revision, field.computed_at, field.marks = field.revision + 1, reading.at, reading.marks
     field.pending = len(reading.pending)
+    field.levels = reading.levels
     field.cameras = CHANGES.dump_python(reading.cameras, mode="json")
 
 

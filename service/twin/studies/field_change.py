@@ -30,12 +30,13 @@ from service.twin.adoption_rules import is_ambiguous
 from service.twin.measurements import accepted_measurement, heights_of, load_heliostat_context
 from service.twin.model_versions import Ends, ModelVersion, effect_key, effect_text, without
 from service.twin.runtime import Runtime
-from service.twin.studies.adoption import study_states
+from service.twin.studies.adoption import StudyState, study_states
 from service.twin.surfaces.accuracy import forecasts_of
 
 _DAYS, _A_DAY = 60, 6  # days with photographs, and photographs of each
 _MOST = 50_000  # newest photographs that they are chosen from
 _REMEMBERED = 64  # pairs of models whose gains are remembered
+_RECENT = 5  # studies, one of which may be adopted
 
 
 class SampledPhotograph(NamedTuple):
@@ -49,9 +50,9 @@ class SampledPhotograph(NamedTuple):
 
 
 def sample_photographs(
-    session: Session, heliostats: Collection[str] | None = None
+    session: Session, heliostats: Collection[str] | None = None, a_day: int = _A_DAY
 ) -> list[SampledPhotograph]:
-    """Choose some photographs of each of the last days, the newest day first.
+    """Choose up to ``a_day`` photographs of each of the last days, the newest day first.
 
     They are of all heliostats with a surface, or of some of them. An ideal mirror would gain by
     every effect that spreads its light.
@@ -75,7 +76,7 @@ def sample_photographs(
         ranked.id, ranked.identifier, HeliostatRow.name, ranked.taken_at, HeliostatRow.id
     )
     query = query.join(HeliostatRow, HeliostatRow.id == ranked.heliostat_id)
-    query = query.where(ranked.age <= _DAYS, ranked.place <= _A_DAY)
+    query = query.where(ranked.age <= _DAYS, ranked.place <= a_day)
     active = store.active_versions(session)
     found = session.execute(query.order_by(ranked.age, ranked.place))
     return [
@@ -364,16 +365,19 @@ class EffectWatch:
         return EffectFindings([one for one in found if one is not None], self._find_adoptable())
 
     def _find_adoptable(self) -> AdoptableStudy | None:
-        """The newest study if REST adopts it without force, and photographs are better with it.
+        """The newest study that REST adopts without force, and with which photographs are better.
 
         They are the reason to adopt what leaves most of the error.
         """
         with self._runtime.database.reading() as session:
-            study = store.newest_study(session)
-            state = None if study is None else study_states(session, [study])[study.id]
-        if study is None or state is None or state.state != "candidate":
+            studies = store.list_studies(session, _RECENT)
+            states = study_states(session, studies)
+        return next((one for row in studies if (one := self._adoptable(row, states[row.id]))), None)
+
+    def _adoptable(self, study: StudyRow, state: StudyState) -> AdoptableStudy | None:
+        if state.state != "candidate" or state.warnings:
             return None
-        if is_ambiguous(state.findings) or state.warnings or state.findings.is_correction:
+        if is_ambiguous(state.findings) or state.findings.is_correction:
             return None
         ends = dict[str, date]()
         change = read_field_change(self._runtime, study.id, None, self._gains)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from datetime import time as clock
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -35,6 +35,7 @@ from model.times import format_minute
 from service import store
 from service.base.choices import Selection
 from service.base.settings import Settings
+from service.store.field_state import read_field_state
 from service.store.listing import Period
 from service.store.tables import (
     HeliostatRow,
@@ -84,6 +85,13 @@ class AccuracyFall:
     def when(self) -> str:
         """The times between which it fell, in words."""
         return f"between {format_minute(self.since)} and {format_minute(self.until)}"
+
+    def of_field(self, levels: Mapping[str, float]) -> float:
+        """What of it is a fall of the whole field [1], by ``levels`` of its accuracy by time."""
+        dated = [(datetime.fromisoformat(at), level) for at, level in levels.items()]
+        before = [level for at, level in dated if at <= self.since]
+        after = [level for at, level in dated if at >= self.until]
+        return max(0.0, fmean(before) - fmean(after)) if before and after else 0.0
 
 
 FALL: TypeAdapter[AccuracyFall] = TypeAdapter(AccuracyFall)
@@ -248,10 +256,13 @@ def _of_fall(
 
 
 def read_fall(session: Session, heliostat: int, settings: Settings) -> AccuracyFall | None:
-    """The fall that a worker found, if it surely exceeds the limit of the settings."""
-    state = session.get(HeliostatStateRow, heliostat)
+    """The fall that a worker found, if it surely exceeds the field's by the limit of settings."""
+    state, levels = session.get(HeliostatStateRow, heliostat), read_field_state(session).levels
     fall = None if state is None or state.fall is None else FALL.validate_python(state.fall)
-    return fall if fall is not None and fall.min_drop > settings.alarm_accuracy_drop else None
+    if fall is None:
+        return None
+    own = fall.min_drop - fall.of_field(levels or {})
+    return fall if own > settings.alarm_accuracy_drop else None
 
 
 def _of_study(session: Session, heliostat: HeliostatRow, zone: ZoneInfo) -> Epoch | None:

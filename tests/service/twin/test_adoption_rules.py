@@ -51,3 +51,9 @@ def test_of_two_effects_of_images_either_will_do(name: str, other: str, expected
     found = StudyFindings("effect", [{"name": name, "lookalikes": [other]}], 0.1)
     assert is_ambiguous(found) is expected
     assert len(open_questions(found)) == 1  # which a person sees in either case
+
+
+def test_of_two_effects_that_ended_either_will_do():
+    scope = {"kind": "since", "since": "2026-06-01", "until": "2026-06-07"}
+    ended = {"name": "slope_error", "lookalikes": ["sun_shape"], "scope": scope}
+    assert not is_ambiguous(StudyFindings("effect", [ended], 0.1))
