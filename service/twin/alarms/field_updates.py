@@ -67,6 +67,13 @@ class _Reading(NamedTuple):
         return [line for line in self.lines if line.pending]
 
 
+class _Levels(NamedTuple):
+    """Levels of the field's accuracy [1] by time, after so many writes of heliostats' states."""
+
+    states: int
+    by_day: dict[str, float]
+
+
 class FieldStateWriter:
     """Writer of the state of heliostats whose data changed, and of the alarms."""
 
@@ -74,6 +81,7 @@ class FieldStateWriter:
         self._runtime, self._effects = runtime, EffectWatch(runtime)
         self._watch = camera_watch(runtime.database)
         self._marks, self._written_s = "", -_AGAIN_S
+        self._levels: _Levels | None = None
         self._has_limit, self.is_large = False, False
 
     def run(self, stopping: threading.Event) -> None:
@@ -125,15 +133,13 @@ class FieldStateWriter:
     def _read(self) -> _Reading:
         settings, effects = self._runtime.settings, self._effects.read()
         with self._runtime.database.reading() as session:
-            revision, at, marks = (
-                field_state.read_field_state(session).revision,
-                now(),
-                read_marks(session),
-            )
+            field, at, marks = (field_state.read_field_state(session), now(), read_marks(session))
             lines, cameras = read_summaries(session), self._watch.read(session, settings)
-            levels = read_levels(session, lines)
+            if self._levels is None or self._levels.states != field.states:
+                self._levels = _Levels(field.states, read_levels(session, lines))
+            levels = self._levels.by_day
             alarms = compute_alarms(session, lines, settings, cameras, effects, levels)
-        return _Reading(revision, at, marks, lines, cameras.changes, levels, alarms)
+        return _Reading(field.revision, at, marks, lines, cameras.changes, levels, alarms)
 
     def _compute(
         self, pending: Sequence[HeliostatOverview], seconds: float, stopping: threading.Event

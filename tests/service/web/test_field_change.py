@@ -181,6 +181,13 @@ def test_a_study_that_helps_is_offered_with_its_end(app: FastAPI, hazy: TestClie
     assert (alarms(hazy, "study_undecided"), alarms(hazy)) == ([], [])
 
 
+def test_a_study_stays_on_offer_after_others(app: FastAPI, hazy: TestClient):
+    keep(app, SLOPE | {"scope": SINCE})
+    keep(app)
+    (alarm,) = alarms(hazy, "study_undecided")
+    assert alarm["offer"]["label"] == "Adopt study 1, ended by 2026-06-07"
+
+
 def test_an_effect_that_never_acted_is_withdrawn(app: FastAPI, hazy: TestClient):
     study = keep(app, SLOPE | {"scope": SINCE | {"since": "2026-06-07"}})
     forced = {"force": True, "reason": "it is so"}
