@@ -42,6 +42,7 @@ from model.metrics import flux_accuracies
 from model.plant_model import JUELICH_MODEL
 from model.study import FluxImage, Study, StudyOptions, loop, study, study_to_json
 from model.study.flux_images import Forecaster
+from service.base.processes import limit_memory, return_memory, returning_memory
 from service.sources.folder import read_folder
 from tests.undeclared.adapter import effects_of, flux_images
 from tests.undeclared.generator import MeasurementSet, generate
@@ -195,12 +196,14 @@ def cost() -> None:
 
 
 def cost_of(taken: Sequence[FluxImage], is_with_terms: bool) -> tuple[float, float]:
-    """Time [s] of this process for a study, and its largest memory [MB]."""
+    """Time [s] of this process for a study, and its largest memory [MB], as in a worker."""
     torch.set_num_threads(1)
+    limit_memory()
     nothing = mock.patch.object(loop, "find_discrepancy", return_value=None)
     with nullcontext() if is_with_terms else nothing:
         start = process_time()
-        study(taken, JUELICH_MODEL)
+        with returning_memory():
+            study(taken, JUELICH_MODEL, progress=lambda name: return_memory())
         return process_time() - start, getrusage(RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -651,6 +651,7 @@ def find_discrepancy(
 
     ``noise`` is the error that even the truth leaves.
     """
+    fitter.forget()
     search = _Search(fitter, base.effects)
     cuts, held_out = search.model.cuts, fitter.split.held_out
     excess = 1 - noise - float(base.accuracy.mean())

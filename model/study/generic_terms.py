@@ -39,7 +39,7 @@ from model.tracing.sensitivity import sensitivity
 
 Array = NDArray[np.float64]
 
-AT_ONCE = 8
+AT_ONCE = 4
 """Photographs whose derivatives are in memory at once."""
 
 STEPS = {"places": 0.02, "sun": 0.02}

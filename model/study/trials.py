@@ -134,6 +134,10 @@ class TrialFitter:
             fine.forget()
         return made
 
+    def forget(self) -> None:
+        """Free the memory of all forecasters of fits; the next fits make them again."""
+        self._forecasters.clear()
+
     def touched(self, rows: Rows, terms: Iterable[Term]) -> Rows:
         """Select the images that at least one term may change."""
         images, some = [self.flux_images[row] for row in rows], list(terms)

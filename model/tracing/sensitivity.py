@@ -29,6 +29,9 @@ from model.tracing.scene import Optics, Scene, Window, irradiance_of, optics_of
 TILT = 1e-4
 """Slope [rad] of the finite difference for the movement of light with the slope."""
 
+# Derivatives that are blurred at once: their spectra take several times the memory of images.
+_AT_ONCE = 16
+
 
 @dataclass(frozen=True, eq=False)
 class HeightChanges:
@@ -102,7 +105,8 @@ def sensitivity(
     slopes = _slopes(scene, samples)
     if shapes is not None:
         slopes = slopes @ shapes.to(slopes).flatten(1).T
-    changes = rays_on_grid.blurred(_sharp(rays_on_grid, moved, slopes, weights))
+    sharp = _sharp(rays_on_grid, moved, slopes, weights)
+    changes = torch.cat([rays_on_grid.blurred(part) for part in torch.split(sharp, _AT_ONCE)])
     weight = (rays_on_grid.weight / rays_on_grid.weight.sum(-1, keepdim=True)).view(
         scene.batch, 1, -1, samples**2, 1
     )

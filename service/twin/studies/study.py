@@ -25,6 +25,7 @@ from service import store
 from service.base.arrays import to_json_value
 from service.base.errors import SKIPPED, ConflictError, NotFoundError, list_reasons
 from service.base.fields import Model, Moment, Name, StudyReport, Text, Whole
+from service.base.processes import return_memory
 from service.base.progress import NamedSteps, Report, no_report
 from service.base.validation import format_validation_error
 from service.drawing.study_report import study_body
@@ -346,7 +347,8 @@ def study_store(runtime: Runtime, request: StudyIn, report: Report = no_report) 
     options = replace(options, between=steps.alive)
 
     def step(name: str) -> None:
-        """Report a step, and let others use the model in between."""
+        """Report a step, and let others use the model and its memory in between."""
+        return_memory()
         runtime.compute_slots.pause(runtime.check)
         steps(name)
 
