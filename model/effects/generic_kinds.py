@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from model.images import COARSE_SIZE
 from model.mount import Mount
 from model.setup import Setup
 from model.tracing import Scene
@@ -149,18 +150,38 @@ class SpotImages:
         """Centre images (n, R, C) on their centres of mass, and scale them to sum one."""
         images = images.clip(min=0)
         images = images / images.sum(axis=(1, 2), keepdims=True)
-        offset = np.einsum("nij,dij->nd", images, self.offsets)
-        phase = np.einsum("nd,dij->nij", offset, self.waves)
+        phase = np.einsum("nd,dij->nij", self._moments(images), self.waves)
         moved = _image_of(_mirrored_spectrum(images) * np.exp(1j * phase))
         moved = moved.clip(min=0)
         return np.asarray(moved / moved.sum(axis=(1, 2), keepdims=True))
 
     def settled_change(self, change: Array) -> Array:
-        """First order of `settle` for a small ``change`` (n, R, C) of images of sum one."""
-        change = change - change.sum(axis=(1, 2), keepdims=True) * self.images
-        offset = change.reshape(len(change), -1) @ self.offsets.reshape(2, -1).T
-        right, up = offset.T[:, :, None, None] * self.slopes
-        return np.asarray(change + right + up)
+        """First order of `settle` for a small ``change`` (n, R, R) of images of sum one.
+
+        Binned to (n, `COARSE_SIZE`, `COARSE_SIZE`).
+        """
+        total, moments = change.sum(axis=(1, 2)), self._moments(change)
+        amounts = (-total, *(moments - total[:, None] * self._moments(self.images)).T)
+        settled = _coarse(change)
+        for amount, part in zip(amounts, self._coarse_parts, strict=True):
+            settled += amount[:, None, None] * part
+        return settled
+
+    @cached_property
+    def _coarse_parts(self) -> list[Array]:
+        """Images and their slopes, right and up, binned to `COARSE_SIZE`."""
+        return [_coarse(part) for part in (self.images, *self.slopes)]
+
+    def _moments(self, images: Array) -> Array:
+        """First moments (n, 2) [m] of images (n, R, C), right and up."""
+        return np.asarray(images.reshape(len(images), -1) @ self.offsets.reshape(2, -1).T)
+
+
+def _coarse(images: Array) -> Array:
+    """Images (n, R, R) in `COARSE_SIZE` pixels a side; ten times faster than a sum over axes."""
+    step = images.shape[-1] // COARSE_SIZE
+    rows = sum((images[:, first::step] for first in range(1, step)), images[:, ::step])
+    return np.asarray(sum((rows[..., n::step] for n in range(1, step)), rows[..., ::step]))
 
 
 def _mirrored_spectrum(images: Array) -> NDArray[np.complex128]:

@@ -510,7 +510,7 @@ class _Search(_Sample):
         """Changes by a kind's components at cuts that have amounts (N, K) of it."""
         if amounts is None:
             amounts = np.zeros((len(cuts), len(kind.components)))
-        values = self.model.derivatives(kind, cuts, amounts, COARSE_SIZE)
+        values = self.model.derivatives(kind, cuts, amounts)
         values = values.reshape(*amounts.shape, -1) / self.peaks[:, None].astype(np.float32)
         sizes = np.sqrt((values[self.is_fitted] ** 2).sum(axis=2).mean(axis=0)) + 1e-12
         return Fields(values / sizes[:, None], sizes.astype(np.float64))

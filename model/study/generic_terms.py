@@ -29,7 +29,7 @@ from model.effects.generic_kinds import (
     mirror_kinds,
 )
 from model.forecast import Aligned, View
-from model.images import FLUX_SIZE
+from model.images import COARSE_SIZE, FLUX_SIZE
 from model.study.flux_images import FluxImage, Forecaster, centers
 from model.tracing import Optics, Scene, Window
 from model.tracing.beam import N_TURNS
@@ -85,16 +85,18 @@ class GenericModel:
         yield from np.array_split(np.arange(count), -(-count // AT_ONCE))
 
     def derivatives(
-        self, kind: GenericKind, cuts: Array, coefficients: Array, size: int
+        self, kind: GenericKind, cuts: Array, coefficients: Array
     ) -> NDArray[np.float32]:
-        """Derivatives (N, K, size, size) of cuts (N, 64, 64) with a kind's coefficients (N, K)."""
-        found = np.empty((len(cuts), len(kind.components), size, size), dtype=np.float32)
+        """Derivatives (N, K, S, S) of cuts (N, 64, 64) with a kind's coefficients (N, K).
+
+        They are binned to S = `COARSE_SIZE`.
+        """
+        shape = (len(cuts), len(kind.components), COARSE_SIZE, COARSE_SIZE)
+        found = np.empty(shape, dtype=np.float32)
         for rows in self._parts():
             spots = self.spots(rows, cuts[rows])
             for number, change in enumerate(self._changes(kind, spots, rows, coefficients[rows])):
-                settled = spots.settled_change(change)
-                step = FLUX_SIZE // size
-                found[rows, number] = settled.reshape(-1, size, step, size, step).sum(axis=(2, 4))
+                found[rows, number] = spots.settled_change(change)
         return found
 
     def _changes(

@@ -35,7 +35,7 @@ def test_derivatives_are_those_of_exact_changes(name):
     model = generic_model()
     kind = next(kind for kind in model.kinds if kind.name == name)
     none = np.zeros((len(model.cuts), len(kind.components)))
-    derivatives = model.derivatives(kind, model.cuts, none, 32)
+    derivatives = model.derivatives(kind, model.cuts, none)
     unchanged = model.apply(kind, model.cuts, none)
     for component in {0, len(kind.components) - 1}:
         derivative = derivatives[:, component]
