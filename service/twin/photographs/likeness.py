@@ -135,10 +135,10 @@ def _like_by_motors(
     heliostats, calibrated = {}, {}
     for row, mount in mounts.current_mounts(session):
         try:
+            heliostats[row.name] = with_drive_zeros(row, own.model.site.origin)
             calibrated[row.name] = mount_of(row, mount, own.model.effects)
         except ConflictError:  # to be calibrated again
             continue
-        heliostats[row.name] = with_drive_zeros(row, own.model.site.origin)
     classifier = ContradictionClassifier(heliostats, calibrated, targets, own.model.site)
     return classifier.classify(twin.row.name, reading).other
 
