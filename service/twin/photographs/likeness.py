@@ -45,19 +45,22 @@ If neither of two mirrors fits, the better one is not named.
 """
 
 DROP = 0.05
-"""Least drop [1] below the heliostat's usual accuracy to compare others at all."""
+"""Least drop [1] below the heliostat's usual accuracy to compare others' surfaces."""
+
+DROP_OF_MOTORS = 0.025
+"""The same to ask the motors, which say more: photographs of others lower the usual accuracy."""
 
 # Newest photographs to search for the heliostats that were photographed last.
 _LOOKED_THROUGH = 64
 
 
-def is_suspicious(accuracy: float, usual: float | None) -> bool:
-    """Whether a photograph's accuracy [1] is clearly below its heliostat's ``usual`` one.
+def is_suspicious(accuracy: float, usual: float | None, drop: float = DROP) -> bool:
+    """Whether a photograph's accuracy [1] is by ``drop`` below its heliostat's ``usual`` one.
 
     ``usual`` is None if unknown. An accuracy that no other heliostat can exceed by `MARGIN` is not
     suspicious.
     """
-    return accuracy < 1 - MARGIN and (usual is None or accuracy < usual - DROP)
+    return accuracy < 1 - MARGIN and (usual is None or accuracy < usual - drop)
 
 
 def find_like(accuracy: float, others: Mapping[str, float]) -> str | None:
@@ -91,11 +94,14 @@ def unlike_warnings(
     name = twin.row.name
     try:
         with runtime.database.reading() as session:
-            if not is_suspicious(accuracy, usual_accuracy(session, twin.row.id)):
+            usual = usual_accuracy(session, twin.row.id)
+            if not is_suspicious(accuracy, usual, DROP_OF_MOTORS):
                 return []
             like = _like_by_motors(session, twin, photograph, measurement.target)
             if like is not None:
                 return [_warning(f"unlike {name}, like {like}: its motors fit that one", like)]
+            if not is_suspicious(accuracy, usual):
+                return []
             candidates = _candidates(session, twin, photograph)
         others = _accuracies(runtime, candidates, measurement)
     except (ModelError, ServiceError) as error:
