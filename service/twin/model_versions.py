@@ -108,6 +108,11 @@ def current_number(session: Session) -> int:
     return DECLARED if row is None else row.number
 
 
+def list_studied(session: Session) -> list[store.Studied]:
+    """What each study with the current version was of, the oldest first."""
+    return store.list_studied(session, current_number(session))
+
+
 def current_version(session: Session) -> str:
     """Number and effects of the current version, as stored with forecasts and surfaces."""
     row = find_current(session)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -299,6 +300,25 @@ class FakeOperations:
             made += FleetFlux(light, 60.0 * count, count, losses=losses)
             done(made)
         return made
+
+
+class ChangingOperations(FakeOperations):
+    """Surfaces forecast photographs exactly, but for a misplaced share of the light."""
+
+    def misplaced(self, heliostat: Heliostat, taken_at: datetime, model: PlantModel) -> float:
+        """Share [1] that a forecast puts into its first pixel; half of the lost accuracy."""
+        raise NotImplementedError
+
+    def render(
+        self, heliostat: Heliostat, observations: list[Observation], z: Any, model: PlantModel
+    ) -> Any:
+        right = super().render(heliostat, observations, z, model)
+        for image, one in zip(right, observations, strict=True):
+            assert one.taken_at is not None
+            share = self.misplaced(heliostat, one.taken_at, model)
+            image *= 1 - share
+            image[0, 0] += 100 * share
+        return right
 
 
 @pytest.fixture

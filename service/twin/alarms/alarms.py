@@ -26,7 +26,6 @@ from model.changes import LevelChange, find_changes
 from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
 from model.times import format_minute
-from service import store
 from service.base.fields import From
 from service.base.settings import Settings
 from service.store import acknowledgements, field_state, queue
@@ -468,7 +467,7 @@ def _fallen(
 ) -> Iterator[Alarm]:
     """Report a heliostat whose photographs are worse since a change, by more than the field's."""
     fall, allowed = line.fall, settings.alarm_accuracy_drop
-    if fall is None or fall.min_drop - fall.of_field(levels) <= allowed:
+    if fall is None or not fall.exceeds(allowed, levels):
         return
     message = (
         f"its accuracy fell {fall.when}: photographs since are forecast with {fall.recent:.0%},"
@@ -486,7 +485,7 @@ def _fallen_together(session: Session, levels: Mapping[str, float]) -> Iterator[
     if fall is None:
         return
     drop = fall.earlier - fall.recent
-    studies = store.list_studied(session, model_versions.current_number(session))
+    studies = model_versions.list_studied(session)
     yield Alarm(
         "fell",
         None,
@@ -607,8 +606,7 @@ def _camera(session: Session) -> Iterator[Alarm]:
 def _watch_cameras(session: Session, cameras: Sequence[CameraChange], zone: str) -> Iterator[Alarm]:
     """Report camera changes in photographs, until a camera is declared again."""
     declared = _declared_anew(session) if cameras else None
-    current = model_versions.current_number(session)
-    studies = store.list_studied(session, current) if cameras else []
+    studies = model_versions.list_studied(session) if cameras else []
     for change in cameras:
         since = datetime.combine(change.day, clock(), ZoneInfo(zone)).astimezone(UTC)
         if declared is None or since > declared.adopted_at:

@@ -592,7 +592,7 @@ def read_facts(
         epoch,
         alarms,
         adopting if study is not None else None,
-        store.list_studied(session, model_versions.current_number(session)),
+        model_versions.list_studied(session),
         None if epoch is None else _confirming(session, row, epoch),
     )
 

@@ -18,7 +18,6 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from model.times import format_minute
-from service import store
 from service.base.settings import Settings
 from service.store.acknowledgements import Key
 from service.store.job_tables import JobRow
@@ -158,7 +157,7 @@ def _offer(session: Session, cause: CommonCause) -> Offer | None:
         names = {one.heliostat for one in cause.members if one.heliostat and one.offer}
         return offers.calibrate(sorted(names)) if names else None
     if reasons & {"accuracy", "fell"} and not offers.has_seen(
-        store.list_studied(session, model_versions.current_number(session)), cause.last_at
+        model_versions.list_studied(session), cause.last_at
     ):
         return offers.study(cause.heliostats, cause.first_at)
     return None

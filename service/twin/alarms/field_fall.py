@@ -22,14 +22,13 @@ _A_DAY = 30  # photographs of a day that count at most
 _FEWEST = 3  # photographs of a day, and heliostats
 _MOST_PENDING = 0.2  # share of heliostats whose accuracies are being computed
 
-
 LEAST = 0.005
 """Least fall of the field's accuracy [1] that counts."""
 
 
 def are_known(lines: Sequence[HeliostatOverview]) -> bool:
     """Whether nearly all accuracies of the field are computed, by one model."""
-    pending = [bool("accuracy" in one.pending) for one in lines if one.surface is not None]
+    pending = ["accuracy" in one.pending for one in lines if one.surface is not None]
     return sum(pending) <= _MOST_PENDING * len(pending)
 
 

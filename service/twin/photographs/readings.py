@@ -10,12 +10,11 @@ from model.errors import InvalidInputError, ModelError
 from model.frames import sun_direction
 from model.plant import Heliostat, TargetPlane
 from model.plant_model import PlantModel
-from model.pointing import Reading
+from model.pointing import Reading, Weather
 from model.pointing.report import day_of
 from service import store
 from service.store.tables import MeasurementRow
 from service.twin.measurements import spot_position
-from service.twin.photographs.metadata import photograph_with_target
 from service.twin.stored_mount import true_sun
 
 Array = NDArray[np.float64]
@@ -75,15 +74,7 @@ def reading_of(
         )
     sun = true_sun(model, sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg), row.taken_at)
     day = day_of(row.taken_at)
-    return Reading(
-        row.identifier,
-        plane.name,
-        motors,
-        sun,
-        spot,
-        day,
-        photograph_with_target(row, plane.name).weather,
-    )
+    return Reading(row.identifier, plane.name, motors, sun, spot, day, Weather.of(row))
 
 
 def motors_of(heliostat: Heliostat, row: MeasurementRow) -> Array:

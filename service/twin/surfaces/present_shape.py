@@ -93,6 +93,10 @@ class AccuracyFall:
         after = [level for at, level in dated if at >= self.until]
         return max(0.0, fmean(before) - fmean(after)) if before and after else 0.0
 
+    def exceeds(self, allowed: float, levels: Mapping[str, float]) -> bool:
+        """Whether it surely exceeds the field's fall by more than ``allowed`` [1]."""
+        return self.min_drop - self.of_field(levels) > allowed
+
 
 FALL: TypeAdapter[AccuracyFall] = TypeAdapter(AccuracyFall)
 """A fall as JSON and back."""
@@ -259,10 +263,9 @@ def read_fall(session: Session, heliostat: int, settings: Settings) -> AccuracyF
     """The fall that a worker found, if it surely exceeds the field's by the limit of settings."""
     state, levels = session.get(HeliostatStateRow, heliostat), read_field_state(session).levels
     fall = None if state is None or state.fall is None else FALL.validate_python(state.fall)
-    if fall is None:
+    if fall is None or not fall.exceeds(settings.alarm_accuracy_drop, levels or {}):
         return None
-    own = fall.min_drop - fall.of_field(levels or {})
-    return fall if own > settings.alarm_accuracy_drop else None
+    return fall
 
 
 def _of_study(session: Session, heliostat: HeliostatRow, zone: ZoneInfo) -> Epoch | None:

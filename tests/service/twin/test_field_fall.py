@@ -11,7 +11,6 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import URL
 
-from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
 from service.base.settings import Settings
@@ -22,7 +21,7 @@ from service.twin.surfaces.present_shape import AccuracyFall
 from service.web.app import create_app
 from tests.service.conftest import (
     QUIET,
-    FakeOperations,
+    ChangingOperations,
     client_of,
     png,
     poster,
@@ -98,19 +97,11 @@ NAMES = ("AA39", "AA40", "AA41", "AA42")
 DAYS, CHANGED = 20, FIRST + timedelta(days=12)
 
 
-class ChangedCamera(FakeOperations):
-    """Surfaces forecast photographs exactly until the camera changes, then 0.08 less."""
+class ChangedCamera(ChangingOperations):
+    """Surfaces forecast photographs well until the camera changes, then with 0.08 less."""
 
-    def render(
-        self, heliostat: Heliostat, observations: list[Observation], z: Any, model: PlantModel
-    ) -> Any:
-        right = super().render(heliostat, observations, z, model)
-        for image, one in zip(right, observations, strict=True):
-            assert one.taken_at is not None
-            share = 0.04 * (one.taken_at >= CHANGED) + 0.001 * (one.taken_at.minute % 7)
-            image *= 1 - share
-            image[0, 0] += 100 * share
-        return right
+    def misplaced(self, heliostat: Heliostat, taken_at: datetime, model: PlantModel) -> float:
+        return 0.04 * (taken_at >= CHANGED) + 0.001 * (taken_at.minute % 7)
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from heliotwin.cli.main import app as command
 from model.effects import acting
-from model.observation import Observation
 from model.plant import Heliostat
 from model.plant_model import PlantModel
 from service.base.errors import ConflictError
@@ -22,7 +21,7 @@ from service.store.tables import StudyRow
 from service.twin.model_versions import get_model, model_if_adopted
 from service.twin.runtime import Runtime
 from service.twin.studies.field_change import EffectGains, sample_photographs
-from tests.service.conftest import FakeOperations, png, poster, until
+from tests.service.conftest import ChangingOperations, FakeOperations, png, poster, until
 from tests.service.statements import statements
 from tests.service.studies import SLOPE, report_of
 from tests.service.web.pages import HTML, keep_study
@@ -33,20 +32,12 @@ SINCE = {"kind": "since", "since": "2026-06-01", "until": None, "heliostats": No
 DAYS = 12
 
 
-class HazyOperations(FakeOperations):
+class HazyOperations(ChangingOperations):
     """Haze until a day: surfaces forecast photographs exactly if the model has an effect then."""
 
-    def render(
-        self, heliostat: Heliostat, observations: list[Observation], z: Any, model: PlantModel
-    ) -> Any:
-        right = super().render(heliostat, observations, z, model)
-        for image, one in zip(right, observations, strict=True):
-            assert one.taken_at is not None
-            is_hazy = one.taken_at.date() < ENDS
-            if bool(acting(model.effects, one.taken_at, heliostat.name)) != is_hazy:
-                image *= 0.95
-                image[0, 0] += 5
-        return right
+    def misplaced(self, heliostat: Heliostat, taken_at: datetime, model: PlantModel) -> float:
+        is_hazy = taken_at.date() < ENDS
+        return 0.05 * (bool(acting(model.effects, taken_at, heliostat.name)) != is_hazy)
 
 
 @pytest.fixture
