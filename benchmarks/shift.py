@@ -313,7 +313,7 @@ class Action(NamedTuple):
 def run_shift(
     store: Path, unseen: Path, photographs: Sequence[PlannedPhotograph], most: int, until_s: float
 ) -> tuple[list[Action], dict[str, float]]:
-    """Take offers until none is left or the time is over.
+    """Take offers until none is left or the time is over; with each model an offer is another.
 
     Returns the change of accuracy [1] by each, and the accuracies at the end.
     """
@@ -321,11 +321,12 @@ def run_shift(
     before = judge(store, unseen, photographs)
     while len(changes) < most and time.monotonic() < until_s:
         with service_on(store) as (client, runtime):
-            left = [one for one in offers(client) if str(one) not in done]
+            model = client.get("/v1/models/current").json()["version"]
+            left = [one for one in offers(client) if str((model, one)) not in done]
             if not left:
                 break
             name, offer = left[0]
-            done.add(str(left[0]))
+            done.add(str((model, left[0])))
             sent(client, offer["method"], offer["path"], offer["body"])
             work(runtime)
         if offer["path"].startswith("/v1/studies/"):  # the page of a heliostat offers it, too

@@ -28,7 +28,7 @@ from model.effects.generic_kinds import GenericKind, Owner, Place
 from model.images import COARSE_SIZE, FLUX_SIZE, binned
 from model.metrics import flux_accuracies
 from model.study.generic_terms import GenericModel
-from model.study.judging import BeforeAfter, Gain, gain_to_json, paired_gain
+from model.study.judging import BeforeAfter, Gain, Rows, gain_to_json, paired_gain
 from model.study.trials import Trial, TrialFitter
 
 Array = NDArray[np.float64]
@@ -136,36 +136,48 @@ class Fields:
 
 
 @dataclass(frozen=True, eq=False)
-class Regression:
-    """Ridge regression of residuals on a term.
+class Design:
+    """How the coefficients of a term make its amounts in photographs.
 
     Attributes
     ----------
-    fields : Fields
-    residual : (N, P)
-        Without any of the term's changes.
     factors : (N, J)
         One, and the covariate.
     owners : (N,)
-        Index of each photograph's owner.
+        Index of each photograph's owner, of ``n_owners``.
     """
+
+    factors: Array
+    owners: NDArray[np.int64]
+    n_owners: int
+
+    def amounts(self, coefficients: Array) -> Array:
+        """Amounts (N, K) of the components in each photograph, by coefficients (owners, M)."""
+        own = coefficients[self.owners].reshape(len(self.owners), self.factors.shape[1], -1)
+        return np.asarray(np.einsum("ni,nik->nk", self.factors, own))
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Ridge regression of residuals (N, P), without any of a term's changes, on the term."""
 
     fields: Fields
     residual: Array
-    factors: Array
-    owners: NDArray[np.int64]
+    design: Design
 
     @cached_property
     def gram(self) -> Array:
         """Products (N, M, M) of the M coefficients' changes."""
-        pairs = np.einsum("ni,nj,nkl->nikjl", self.factors, self.factors, self.fields.gram)
+        factors = self.design.factors
+        pairs = np.einsum("ni,nj,nkl->nikjl", factors, factors, self.fields.gram)
         size = pairs.shape[1] * pairs.shape[2]
         return np.asarray(pairs.reshape(-1, size, size))
 
     def _products(self, images: Array) -> Array:
         """Products (N, M) of the coefficients' changes with images (N, P)."""
         each = (self.fields.values @ images.astype(np.float32)[:, :, None])[:, :, 0]
-        return np.asarray(np.einsum("ni,nk->nik", self.factors, each).reshape(len(images), -1))
+        products = np.einsum("ni,nk->nik", self.design.factors, each)
+        return np.asarray(products.reshape(len(images), -1))
 
     @cached_property
     def right(self) -> Array:
@@ -174,35 +186,34 @@ class Regression:
 
     def solve(self, training: Mask, ridge: float) -> Array:
         """Coefficients (owners, M) by the photographs of ``training`` (N,)."""
-        found = np.zeros((self.owners.max() + 1, self.gram.shape[-1]))
+        found = np.zeros((self.design.n_owners, self.gram.shape[-1]))
         for owner in range(len(found)):
-            own = training & (self.owners == owner)
+            own = training & (self.design.owners == owner)
             gram = self.gram[own].sum(axis=0) + ridge * np.eye(found.shape[1])
             found[owner] = np.linalg.solve(gram, self.right[own].sum(axis=0))
         return found
 
-    def amounts(self, coefficients: Array) -> Array:
-        """Amounts (N, K) of the components in each photograph."""
-        own = coefficients[self.owners].reshape(len(self.owners), self.factors.shape[1], -1)
-        return np.asarray(np.einsum("ni,nik->nk", self.factors, own))
+    def in_units(self, coefficients: Array) -> Array:
+        """Coefficients (owners, M) of components of unit size, in the components' units."""
+        return coefficients / np.tile(self.fields.sizes, self.design.factors.shape[1])
 
     def left(self, coefficients: Array) -> Array:
         """What of the residual (N, P) is left."""
-        return self.residual - self.fields.total(self.amounts(coefficients))
+        return self.residual - self.fields.total(self.design.amounts(coefficients))
 
     def left_without(self, groups: NDArray[np.int64], ridge: float) -> Array:
         """What of the residual (N, P) is left by fits to the photographs of other ``groups``."""
         amounts = np.empty(self.fields.values.shape[:2])
         for group in np.unique(groups):
             out = groups == group
-            amounts[out] = self.amounts(self.solve(~out, ridge))[out]
+            amounts[out] = self.design.amounts(self.solve(~out, ridge))[out]
         return self.residual - self.fields.total(amounts)
 
     def deviations(self, coefficients: Array, training: Mask, ridge: float) -> Array:
         """Standard deviations (owners, M) by the sandwich estimator over photographs."""
         scores, found = self._products(self.left(coefficients)), np.zeros_like(coefficients)
         for owner in range(len(found)):
-            own = training & (self.owners == owner)
+            own = training & (self.design.owners == owner)
             bread = np.linalg.inv(self.gram[own].sum(axis=0) + ridge * np.eye(found.shape[1]))
             filling = scores[own].T @ scores[own] * own.sum() / max(1, own.sum() - 1)
             found[owner] = np.sqrt(np.diag(bread @ filling @ bread))
@@ -215,15 +226,11 @@ class Linearised(NamedTuple):
     fields: Fields
     residual: Array
 
-    def subset(self, rows: Mask) -> "Linearised":
-        """The same of some photographs."""
-        return Linearised(Fields(self.fields.values[rows], self.fields.sizes), self.residual[rows])
-
 
 class Iterated(NamedTuple):
-    """Cuts (N, 64, 64) with a fitted term, and the linear model there."""
+    """Coefficients (owners, M) of a fitted term in its units, and the linear model there."""
 
-    cuts: Array
+    coefficients: Array
     point: Linearised
 
 
@@ -480,6 +487,15 @@ class _Sample:
         of_owner = len(term.kind.components) * (1 + (term.scaling is not None))
         return of_owner * len(self.owners[term.owner][0])
 
+    def design(self, term: GenericTerm, rows: Rows) -> Design:
+        """How a term's coefficients make its amounts in some photographs."""
+        factors = [np.ones(len(rows))]
+        if term.scaling is not None:
+            mean, std, _ = self.scale(term.scaling)
+            factors.append((self.covariates[term.scaling][rows] - mean) / std)
+        names, owners = self.owners[term.owner]
+        return Design(np.stack(factors, axis=1), owners[rows], len(names))
+
     def simplest(self, choices: Sequence[TermChoice], share: float) -> TermChoice:
         """The one of fewest coefficients among those that gain this share of the best one's."""
         best = max(choices, key=lambda one: one.gain)
@@ -492,45 +508,36 @@ class _Search(_Sample):
 
     def __init__(self, fitter: TrialFitter, effects: Sequence[Effect]) -> None:
         super().__init__(fitter)
-        rows, options = np.arange(len(fitter.flux_images)), fitter.options
-        self.model = GenericModel(fitter.forecaster(rows, options.view), effects, options.fit_view)
-        self.measured = self.model.forecaster.measured(FLUX_SIZE)
+        self.all, options = np.arange(len(fitter.flux_images)), fitter.options
+        self.fitted = fitter.split.fitted
+        forecaster = fitter.forecaster(self.all, options.view)
+        self.model = GenericModel(forecaster, effects, options.fit_view)
+        self.measured = forecaster.measured(FLUX_SIZE)
         self.peaks = binned(self.measured, COARSE_SIZE).max(axis=(1, 2))[:, None]
 
-    def residual(self, cuts: Array) -> Array:
-        """Measured minus forecast (N, P), in shares of peaks."""
-        difference = binned(self.measured - cuts, COARSE_SIZE)
-        return np.asarray(difference.reshape(len(cuts), -1) / self.peaks)
+    def residual(self, cuts: Array, rows: Rows) -> Array:
+        """Measured minus forecast (n, P) of some photographs, in shares of peaks."""
+        difference = binned(self.measured[rows] - cuts, COARSE_SIZE)
+        return np.asarray(difference.reshape(len(cuts), -1) / self.peaks[rows])
 
-    def accuracy(self, left: Array, rows: Mask | slice = slice(None)) -> float:
+    def accuracy(self, left: Array, rows: Rows) -> float:
         """Mean accuracy of photographs with an error (n, P) in shares of peaks."""
         return 1 - float((np.abs(left) * self.peaks[rows]).sum(axis=1).mean())
 
-    def fields(self, kind: GenericKind, cuts: Array, amounts: Array | None = None) -> Fields:
-        """Changes by a kind's components at cuts that have amounts (N, K) of it."""
-        if amounts is None:
-            amounts = np.zeros((len(cuts), len(kind.components)))
-        values = self.model.derivatives(kind, cuts, amounts)
-        values = values.reshape(*amounts.shape, -1) / self.peaks[:, None].astype(np.float32)
-        sizes = np.sqrt((values[self.is_fitted] ** 2).sum(axis=2).mean(axis=0)) + 1e-12
-        return Fields(values / sizes[:, None], sizes.astype(np.float64))
-
-    def regression(
-        self, term: GenericTerm, point: Linearised, rows: Mask | slice = slice(None)
-    ) -> Regression:
-        """The regression of all photographs, or of those of a point at some ``rows``."""
-        factors = [np.ones(len(self.is_fitted))]
-        if term.scaling is not None:
-            mean, std, _ = self.scale(term.scaling)
-            factors.append((self.covariates[term.scaling] - mean) / std)
-        owners = self.owners[term.owner][1][rows]
-        return Regression(*point, np.stack(factors, axis=1)[rows], owners)
+    def linear(self, kind: GenericKind, rows: Rows, cuts: Array, amounts: Array) -> Linearised:
+        """The linear model of a kind at cuts (n, 64, 64) that have amounts (n, K) of it."""
+        values = self.model.derivatives(kind, rows, cuts, amounts)
+        values = values.reshape(*amounts.shape, -1) / self.peaks[rows, None].astype(np.float32)
+        is_fitted = self.is_fitted[rows]
+        sizes = np.sqrt((values[is_fitted] ** 2).sum(axis=2).mean(axis=0)) + 1e-12
+        fields = Fields(values / sizes[:, None], sizes.astype(np.float64))
+        return Linearised(fields, self.residual(cuts, rows) + fields.total(amounts * fields.sizes))
 
     def cross_validated(self, term: GenericTerm, point: Linearised, ridge: float) -> float:
-        """Accuracy of the fitted photographs, those of ``point``, each by a fit without it."""
-        regression = self.regression(term, point, self.is_fitted)
-        left = regression.left_without(self.folds[self.is_fitted], ridge)
-        return self.accuracy(left, self.is_fitted)
+        """Accuracy of the fitted photographs, each by a fit without it."""
+        regression = Regression(*point, self.design(term, self.fitted))
+        left = regression.left_without(self.folds[self.fitted], ridge)
+        return self.accuracy(left, self.fitted)
 
     def best(self, cuts: Array, least: float = -np.inf) -> TermChoice:
         """The simplest of the best terms.
@@ -539,15 +546,15 @@ class _Search(_Sample):
         term of each of the best kinds is fitted by Gauss-Newton, for strong changes of mirrors are
         not linear.
         """
-        before = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
+        cuts = cuts[self.fitted]
+        before = self.accuracy(self.residual(cuts, self.fitted), self.fitted)
 
         def choices(
             terms: Iterable[GenericTerm], point: Linearised, ridges: Sequence[float]
         ) -> list[TermChoice]:
-            part = point.subset(self.is_fitted)
             pairs = ((term, ridge) for term in terms for ridge in ridges)
             return [
-                TermChoice(term, ridge, self.cross_validated(term, part, ridge) - before, point)
+                TermChoice(term, ridge, self.cross_validated(term, point, ridge) - before, point)
                 for term, ridge in pairs
             ]
 
@@ -570,48 +577,53 @@ class _Search(_Sample):
         return replace(chosen, rival=find_rival(self, chosen, others))
 
     def linearise(self, kind: GenericKind, cuts: Array) -> Linearised:
-        """The linear model of a kind, about its best constant amounts if those are fast to find."""
-        point = Linearised(self.fields(kind, cuts), self.residual(cuts))
+        """The linear model of a kind at the fitted photographs' cuts, about its best constant
+        amounts if those are fast to find.
+        """
+        none = np.zeros((len(cuts), len(kind.components)))
+        point = self.linear(kind, self.fitted, cuts, none)
         if kind.basis is None:
             return point
         term = GenericTerm(kind, None, kind.owners[0])
         return self.iterate(term, RIDGES[1], cuts, point).point
 
     def iterate(self, term: GenericTerm, ridge: float, cuts: Array, point: Linearised) -> Iterated:
-        """Fit a term by Gauss-Newton, with exact changes of the cuts."""
-        best = self.accuracy(self.residual(cuts)[self.is_fitted], self.is_fitted)
-        found = Iterated(cuts, point)
+        """Fit a term by Gauss-Newton, with exact changes of the fitted photographs' cuts."""
+        rows, everything = self.fitted, np.full(len(cuts), True)
+        best, design = self.accuracy(self.residual(cuts, rows), rows), self.design(term, rows)
+        found = Iterated(np.zeros((design.n_owners, self.count(term) // design.n_owners)), point)
         for _ in range(ITERATIONS):
-            regression = self.regression(term, found.point)
-            amounts = regression.amounts(regression.solve(self.is_fitted, ridge))
-            amounts = amounts / found.point.fields.sizes
-            changed = self.model.apply(term.kind, cuts, amounts)
-            left = self.residual(changed)
-            accuracy = self.accuracy(left[self.is_fitted], self.is_fitted)
+            regression = Regression(*found.point, design)
+            coefficients = regression.in_units(regression.solve(everything, ridge))
+            amounts = design.amounts(coefficients)
+            changed = self.model.apply(term.kind, rows, cuts, amounts)
+            accuracy = self.accuracy(self.residual(changed, rows), rows)
             if accuracy <= best + MIN_PROGRESS:
                 break
-            fields, best = self.fields(term.kind, changed, amounts), accuracy
-            residual = left + fields.total(amounts * fields.sizes)
-            found = Iterated(changed, Linearised(fields, residual))
+            best = accuracy
+            found = Iterated(coefficients, self.linear(term.kind, rows, changed, amounts))
         return found
 
     def fit(self, choice: TermChoice, cuts: Array) -> FittedTerm:
-        """Fit a chosen term."""
-        found = self.iterate(choice.term, choice.ridge, cuts, choice.point)
-        regression = self.regression(choice.term, found.point)
-        return FittedTerm(choice, regression, found.cuts, self.is_fitted)
+        """Fit a chosen term, and apply it to all photographs."""
+        term, design = choice.term, self.design(choice.term, self.all)
+        found = self.iterate(term, choice.ridge, cuts[self.fitted], choice.point)
+        amounts = design.amounts(found.coefficients)
+        changed = self.model.apply(term.kind, self.all, cuts, amounts)
+        point = self.linear(term.kind, self.all, changed, amounts)
+        return FittedTerm(choice, Regression(*point, design), changed, self.is_fitted)
 
     def transfer(self, found: Sequence[FittedTerm], groups: Sequence[object]) -> BeforeAfter | None:
         """Accuracy of photographs of each group by fits to the other groups; None for one group."""
         names, index = np.unique([str(group) for group in groups], return_inverse=True)
         if len(names) < 2:
             return None
-        left = self.residual(found[-1].cuts)
+        left = self.residual(found[-1].cuts, self.all)
         for fitted in found:
             whole = fitted.regression.left(fitted.coefficients)
             left = left + fitted.regression.left_without(index, fitted.choice.ridge) - whole
-        before = self.residual(self.model.cuts)
-        return BeforeAfter(self.accuracy(before), self.accuracy(left))
+        before = self.residual(self.model.cuts, self.all)
+        return BeforeAfter(self.accuracy(before, self.all), self.accuracy(left, self.all))
 
 
 def find_rival(search: _Search, best: TermChoice, others: Sequence[TermGain]) -> Rival | None:

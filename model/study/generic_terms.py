@@ -31,6 +31,7 @@ from model.effects.generic_kinds import (
 from model.forecast import Aligned, View
 from model.images import COARSE_SIZE, FLUX_SIZE
 from model.study.flux_images import FluxImage, Forecaster, centers
+from model.study.judging import Rows
 from model.tracing import Optics, Scene, Window
 from model.tracing.beam import N_TURNS
 from model.tracing.convolution import beam_moves, central_rays, raster, splat
@@ -67,7 +68,7 @@ class GenericModel:
         self.traces = TracedTerms(forecaster, self.aligned, self.view, traced)
         self.kinds = [*IMAGE_KINDS, *traced]
 
-    def spots(self, rows: NDArray[np.intp], cuts: Array) -> SpotImages:
+    def spots(self, rows: Rows, cuts: Array) -> SpotImages:
         """The geometry of some photographs with cuts (n, 64, 64)."""
         window = self.forecaster.window
         return SpotImages(
@@ -80,27 +81,27 @@ class GenericModel:
             moves=self.moves[rows],
         )
 
-    def _parts(self) -> Iterator[NDArray[np.intp]]:
-        count = len(self.cuts)
-        yield from np.array_split(np.arange(count), -(-count // AT_ONCE))
+    def _parts(self, rows: Rows, cuts: Array) -> Iterator[tuple[Rows, Rows, SpotImages]]:
+        """A few photographs at once: their places among ``rows``, their rows and geometry."""
+        for part in np.array_split(np.arange(len(rows)), -(-len(rows) // AT_ONCE)):
+            yield part, rows[part], self.spots(rows[part], cuts[part])
 
     def derivatives(
-        self, kind: GenericKind, cuts: Array, coefficients: Array
+        self, kind: GenericKind, rows: Rows, cuts: Array, coefficients: Array
     ) -> NDArray[np.float32]:
-        """Derivatives (N, K, S, S) of cuts (N, 64, 64) with a kind's coefficients (N, K).
+        """Derivatives (n, K, S, S) of cuts (n, 64, 64) with a kind's coefficients (n, K).
 
-        They are binned to S = `COARSE_SIZE`.
+        They are of the photographs ``rows`` (n,), and binned to S = `COARSE_SIZE`.
         """
-        shape = (len(cuts), len(kind.components), COARSE_SIZE, COARSE_SIZE)
+        shape = (len(rows), len(kind.components), COARSE_SIZE, COARSE_SIZE)
         found = np.empty(shape, dtype=np.float32)
-        for rows in self._parts():
-            spots = self.spots(rows, cuts[rows])
-            for number, change in enumerate(self._changes(kind, spots, rows, coefficients[rows])):
-                found[rows, number] = spots.settled_change(change)
+        for part, some, spots in self._parts(rows, cuts):
+            for number, change in enumerate(self._changes(kind, spots, some, coefficients[part])):
+                found[part, number] = spots.settled_change(change)
         return found
 
     def _changes(
-        self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
+        self, kind: GenericKind, spots: SpotImages, rows: Rows, coefficients: Array
     ) -> Iterator[Array]:
         """Changes (n, 64, 64) of cuts by each component."""
         if kind.basis is None:
@@ -114,16 +115,15 @@ class GenericModel:
             else:
                 yield part * (spots.images if kind.operator == "scale" else spots.peaks)
 
-    def apply(self, kind: GenericKind, cuts: Array, coefficients: Array) -> Array:
-        """Cuts (N, 64, 64) with a kind's coefficients (N, K)."""
+    def apply(self, kind: GenericKind, rows: Rows, cuts: Array, coefficients: Array) -> Array:
+        """Cuts (n, 64, 64) of the photographs ``rows`` (n,) with a kind's coefficients (n, K)."""
         found = np.empty_like(cuts)
-        for rows in self._parts():
-            spots = self.spots(rows, cuts[rows])
-            found[rows] = spots.settle(self._applied(kind, spots, rows, coefficients[rows]))
+        for part, some, spots in self._parts(rows, cuts):
+            found[part] = spots.settle(self._applied(kind, spots, some, coefficients[part]))
         return found
 
     def _applied(
-        self, kind: GenericKind, spots: SpotImages, rows: NDArray[np.intp], coefficients: Array
+        self, kind: GenericKind, spots: SpotImages, rows: Rows, coefficients: Array
     ) -> Array:
         if kind.basis is not None:
             return changed_images(kind, spots, coefficients)
@@ -144,14 +144,15 @@ class TracedTerms:
             one.scene.with_(beam_turns=beam_turns(one.setups, one.scene)) for one in aligned.groups
         ]
         self._cached: dict[bytes, dict[str, NDArray[np.float32]]] = {}
+        self._plain: dict[bytes, Array] = {}
 
-    def changes(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
+    def changes(self, kind: GenericKind, rows: Rows, coefficients: Array) -> Array:
         """Changes (K, n, 64, 64) of the cuts that have coefficients (n, K)."""
         if kind.operator in ("heights", "sun") and coefficients.any():
             return self._traced([kind], rows, coefficients)
         return np.asarray(self._unchanged(rows)[kind.name], dtype=np.float64)
 
-    def _unchanged(self, rows: NDArray[np.intp]) -> dict[str, NDArray[np.float32]]:
+    def _unchanged(self, rows: Rows) -> dict[str, NDArray[np.float32]]:
         """Changes of cuts without coefficients, by kind; they are traced once for all cuts."""
         key = rows.tobytes()
         if key not in self._cached:
@@ -162,9 +163,7 @@ class TracedTerms:
             self._cached[key] = dict(zip(names, parts, strict=True))
         return self._cached[key]
 
-    def _traced(
-        self, kinds: Sequence[GenericKind], rows: NDArray[np.intp], coefficients: Array
-    ) -> Array:
+    def _traced(self, kinds: Sequence[GenericKind], rows: Rows, coefficients: Array) -> Array:
         """Changes (K, n, 64, 64) by all kinds, of cuts that have coefficients of the first."""
         view, (first, *_) = self.view, kinds
         heights, light = (
@@ -195,25 +194,31 @@ class TracedTerms:
                     found += [(image - found[0]) / size for image in images]
             return torch.cat(found)
 
-        return self._each_part(rows, coefficients, trace)[1:]
+        images = self._each_part(rows, coefficients, trace)
+        if not coefficients.any():
+            self._plain[rows.tobytes()] = images[0].copy()
+        return np.asarray(images[1:] / images[0].sum(axis=(1, 2), keepdims=True))
 
-    def deformation(self, kind: GenericKind, rows: NDArray[np.intp], coefficients: Array) -> Array:
+    def deformation(self, kind: GenericKind, rows: Rows, coefficients: Array) -> Array:
         """Change (n, 64, 64) of the cuts by coefficients (n, K) of a kind."""
 
         def trace(scene: Scene, window: Window, optics: Optics, amounts: Tensor) -> Tensor:
-            scenes = scene, deformed(scene, [kind], amounts)
-            return torch.stack([self.view.trace(one, window, optics) for one in scenes])
+            mirrors = deformed(scene, [kind], amounts) if amounts.any() else scene
+            return self.view.trace(mirrors, window, optics)[None]
 
-        unchanged, changed = self._each_part(rows, coefficients, trace)
-        return np.asarray(changed - unchanged)
+        key = rows.tobytes()
+        if key not in self._plain:
+            (self._plain[key],) = self._each_part(rows, np.zeros_like(coefficients), trace)
+        plain, (changed,) = self._plain[key], self._each_part(rows, coefficients, trace)
+        return np.asarray((changed - plain) / plain.sum(axis=(1, 2), keepdims=True))
 
     def _each_part(
         self,
-        rows: NDArray[np.intp],
+        rows: Rows,
         coefficients: Array,
         trace: Callable[[Scene, Window, Optics, Tensor], Tensor],
     ) -> Array:
-        """Cuts (M, n, 64, 64) of some photographs, traced with their coefficients."""
+        """Images (M, n, 64, 64) of some photographs, traced with their coefficients."""
         places = {row: place for place, row in enumerate(rows.tolist())}
         found, order = [], []
         optics_effects = effects_of_stage(self.aligned.model.effects, "optics")
@@ -229,8 +234,7 @@ class TracedTerms:
                 with torch.no_grad():
                     found.append(trace(scene.subset(some), window, optics, amounts).numpy())
                 order += own
-        images = np.concatenate(found, axis=1)[:, np.argsort(order)]
-        return np.asarray(images / images[0].sum(axis=(1, 2), keepdims=True))
+        return np.asarray(np.concatenate(found, axis=1)[:, np.argsort(order)])
 
 
 def _light_changes(

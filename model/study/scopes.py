@@ -133,10 +133,11 @@ def best_span(saved: Array, days: Sequence[date]) -> Span | None:
     """Return the days between which an effect saves most; None if there is one day only.
 
     ``saved`` (strengths, N) is the saving of each photograph. A span of fewer than `MIN_SPAN` days
-    with photographs has no end.
+    with photographs has no end. Strengths at which the model fails save minus infinity, and do not
+    count.
     """
-    known = sorted(set(days))
-    if len(known) < 2:
+    known, saved = sorted(set(days)), saved[np.isfinite(saved).all(axis=1)]
+    if len(known) < 2 or not len(saved):
         return None
     of_day = np.array([saved[:, [d == day for d in days]].sum(axis=1) for day in known])
     sums = np.vstack([np.zeros(len(saved)), of_day.cumsum(axis=0)])

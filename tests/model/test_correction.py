@@ -163,7 +163,7 @@ def test_forecasts_change_as_studies_fit_it(entries):
     kind = next(kind for kind in fitted.kinds if kind.name == one["kind"])
     amounts = np.zeros((len(taken), len(kind.components)))
     amounts[:, [c.name for c in kind.components].index(one["name"])] = one["value"]
-    expected = fitted.apply(kind, fitted.cuts, amounts)
+    expected = fitted.apply(kind, np.arange(len(taken)), fitted.cuts, amounts)
     data = {"coefficients": [one], "window_m": 5.0}
     cuts = forecaster.cuts([correction_from_json(data)])
     change = np.abs(expected - fitted.cuts).sum()

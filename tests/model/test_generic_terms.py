@@ -9,7 +9,7 @@ from model.covariates import SCALINGS
 from model.effects.generic_kinds import IMAGE_KINDS, mirror_kinds
 from model.forecast import View
 from model.plant_model import JUELICH_MODEL
-from model.study.discrepancy import Fields, GenericTerm, Regression, photographs_to_compare
+from model.study.discrepancy import Design, Fields, GenericTerm, Regression, photographs_to_compare
 from model.study.flux_images import Forecaster, centers, spot_window
 from model.study.generic_terms import GenericModel
 from model.study.halves import LEVEL, Strength, p_equal, strength
@@ -34,15 +34,16 @@ def generic_model() -> GenericModel:
 def test_derivatives_are_those_of_exact_changes(name):
     model = generic_model()
     kind = next(kind for kind in model.kinds if kind.name == name)
-    none = np.zeros((len(model.cuts), len(kind.components)))
-    derivatives = model.derivatives(kind, model.cuts, none)
-    unchanged = model.apply(kind, model.cuts, none)
+    rows = np.arange(len(model.cuts))
+    none = np.zeros((len(rows), len(kind.components)))
+    derivatives = model.derivatives(kind, rows, model.cuts, none)
+    unchanged = model.apply(kind, rows, model.cuts, none)
     for component in {0, len(kind.components) - 1}:
         derivative = derivatives[:, component]
         step = 0.001 / np.abs(derivative).sum(axis=(1, 2)).max()
         amounts = none.copy()
         amounts[:, component] = step
-        change = (model.apply(kind, model.cuts, amounts) - unchanged) / step
+        change = (model.apply(kind, rows, model.cuts, amounts) - unchanged) / step
         coarse = change.reshape(-1, 32, 2, 32, 2).sum(axis=(2, 4))
         error = np.abs(coarse - derivative).sum() / np.abs(derivative).sum()
         assert error < 0.25, kind.components[component]
@@ -52,8 +53,9 @@ def test_derivatives_are_those_of_exact_changes(name):
 def test_changed_cuts_are_centred_and_of_sum_one(name):
     model = generic_model()
     kind = next(kind for kind in model.kinds if kind.name == name)
-    amounts = np.full((len(model.cuts), len(kind.components)), 0.02)
-    cuts = model.apply(kind, model.cuts, amounts)
+    rows = np.arange(len(model.cuts))
+    amounts = np.full((len(rows), len(kind.components)), 0.02)
+    cuts = model.apply(kind, rows, model.cuts, amounts)
     np.testing.assert_allclose(cuts.sum(axis=(1, 2)), 1)
     planes = [model.planes[0]] * len(cuts)
     pixel = planes[0].width / cuts.shape[2]
@@ -66,8 +68,9 @@ def test_a_regression_finds_what_belongs_to_an_owner_and_scales_with_a_covariate
     owners = np.arange(12) % 2
     factors = np.stack([np.ones(12), rng.standard_normal(12)], axis=1)
     truth = rng.standard_normal((2, 4))
-    empty = Regression(fields, np.zeros((12, 30)), factors, owners)
-    regression = Regression(fields, -empty.left(truth), factors, owners)
+    design = Design(factors, owners, 2)
+    empty = Regression(fields, np.zeros((12, 30)), design)
+    regression = Regression(fields, -empty.left(truth), design)
     everything = np.full(12, True)
     found = regression.solve(everything, 1e-9)
     np.testing.assert_allclose(found, truth, atol=1e-5)

@@ -200,6 +200,9 @@ def test_the_day_of_a_change_is_the_one_after_which_most_is_saved():
     saved = np.array([[-1.0, 0.5, -1, -1, 3, 2, -0.5, 3], [-4.0, 0, -4, -4, 2, 1, -2, 2]])
     assert best_span(saved, days) == Span(date(2024, 6, 5), None, 7.5)
     assert best_span(saved[:, :1], days[:1]) is None
+    failed = np.full((1, 8), -np.inf)  # strengths at which no attitude reflects the sun there
+    assert best_span(np.vstack([failed, saved]), days) == best_span(saved, days)
+    assert best_span(failed, days) is None
     since, by_day = time_scopes(
         CameraResponse, saved, [days[0]] * 4 + [days[1]] * 4, np.array(["a"] * 8)
     )

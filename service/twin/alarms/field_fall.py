@@ -46,10 +46,14 @@ def read_levels(session: Session, lines: Sequence[HeliostatOverview]) -> dict[st
 
 
 def find_field_fall(levels: Mapping[str, float]) -> AccuracyFall | None:
-    """The last fall of the field's accuracy from which it has not recovered."""
+    """The last fall of the field's accuracy by more than `LEAST` from which it has not recovered.
+
+    A study may correct one change and leave another: small falls, one after the other, count
+    together.
+    """
     dated = sorted((datetime.fromisoformat(at), level) for at, level in levels.items())
-    fall = find_accuracy_fall([at for at, _ in dated], [level for _, level in dated])
-    return fall if fall is not None and fall.earlier - fall.recent > LEAST else None
+    times, values = [at for at, _ in dated], [level for _, level in dated]
+    return find_accuracy_fall(times, values, LEAST)
 
 
 def _relative_accuracies(session: Session, lines: Sequence[HeliostatOverview]) -> dict[int, float]:

@@ -103,14 +103,17 @@ FALL: TypeAdapter[AccuracyFall] = TypeAdapter(AccuracyFall)
 
 
 def find_accuracy_fall(
-    times: Sequence[datetime], accuracies: Sequence[float]
+    times: Sequence[datetime], accuracies: Sequence[float], least: float = 0.0
 ) -> AccuracyFall | None:
-    """The last fall of accuracies (n,) [1] in order of time from which they have not recovered."""
+    """The last fall of accuracies (n,) [1] in order of time from which they have not recovered.
+
+    It is of more than ``least`` [1], to what they are now.
+    """
     changes = find_changes(times, accuracies)
     for change in reversed(changes):
-        min_drop = change.min_drop - (changes[-1].after - change.after)
-        if min_drop > 0:
-            recent = changes[-1].after
+        recent = changes[-1].after
+        min_drop = change.min_drop - (recent - change.after)
+        if min_drop > 0 and change.before - recent > least:
             return AccuracyFall(change.since, change.until, change.before, recent, min_drop)
     return None
 

@@ -76,6 +76,16 @@ def test_what_is_small_or_has_recovered_is_no_fall_of_the_field():
         assert find_field_fall(levels_of(taken, relative)) is None, size
 
 
+def test_small_falls_one_after_the_other_count_together():
+    """A corrected week of haze leaves a little, and another camera is as small."""
+    taken, rng = photographs(40, 8), np.random.default_rng(2)
+    fell = [0.7 * LEAST * (day >= 18) + 0.7 * LEAST * (day >= 28) for day in range(40)]
+    relative = {one.id: rng.normal(0, 0.002) - fell[(one.taken_at - FIRST).days] for one in taken}
+    fall = find_field_fall(levels_of(taken, relative))
+    assert fall is not None
+    assert fall.since < FIRST + timedelta(days=18) <= fall.until
+
+
 def test_days_of_few_heliostats_have_no_level():
     taken = photographs(10, 8)
     known = {one.id: 0.0 for one in taken if one.heliostat in ("H0", "H1")}
