@@ -15,7 +15,7 @@ from model.study.halves import find_drifts
 from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
 from model.study.parameters import Term
 from model.study.scope_search import ScopeSearch
-from model.study.selection import ForwardSelection
+from model.study.selection import ForwardSelection, exchange_begins
 from model.study.trials import StudyOptions, Trial, TrialFitter
 
 MIN_IMAGES = 4
@@ -92,7 +92,10 @@ def study(
         )
         found[dated] = Found(term.kind.name, choice.gain, shape, _names(term, choice.lookalikes))
         current = selection.prune_redundant(fitter.forecast(trial) if dated != term else trial)
-        found = {known: one for known, one in found.items() if known in current.parameters.terms}
+        terms = current.parameters.terms
+        current = exchange_begins(selection, current)
+        renamed = dict(zip(terms, current.parameters.terms, strict=True))
+        found = {renamed[known]: one for known, one in found.items() if known in renamed}
         left = [
             other for other in left if other.kind is not term.kind or term.heliostats is not None
         ]

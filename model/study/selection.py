@@ -10,10 +10,12 @@ the mean is above a minimum.
 Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
 added. If the best has values by day, a much simpler one that gains most of that goes before it:
 what it leaves may be another effect's. After each addition effects that are no longer worthwhile
-are pruned.
+are pruned, and the begins of two effects are exchanged where that is better.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -213,6 +215,42 @@ class ForwardSelection:
             if not self.is_worthwhile(term, self.gain_where_acting(term, current, reduced)):
                 current = reduced
         return current
+
+
+def exchange_begins(selection: ForwardSelection, current: Trial) -> Trial:
+    """Exchange the begins of two effects where that is better; their order stays.
+
+    If a camera is changed within a week of haze, what is found first begins with the week, and what
+    is found second begins with the camera.
+    """
+    fitter, scopes = selection.fitter, selection.scopes
+    for terms in _begins_exchanged(current.parameters.terms, scopes):
+        trial = fitter.fit(terms, current)
+        for place in np.flatnonzero([one not in current.parameters.terms for one in terms]):
+            without = fitter.fit([*terms[:place], *terms[place + 1 :]], trial)
+            terms[place], trial = scopes.refine_span(terms[place], trial, without)
+        trial = fitter.forecast(trial)
+        if is_distinct(selection.gain(trial, current)):
+            return trial
+    return current
+
+
+def _begins_exchanged(terms: Sequence[Term], scopes: ScopeSearch) -> Iterator[list[Term]]:
+    """The same effects with the begins of two of all heliostats exchanged."""
+    places = [
+        place
+        for place, one in enumerate(terms)
+        if one.since and one.heliostats is None and not scopes.has_full_scope(one)
+    ]
+    for pair in combinations(places, 2):
+        exchanged = list(terms)
+        for place, other in (pair, pair[::-1]):
+            exchanged[place] = replace(terms[place], since=terms[other].since)
+        some = [exchanged[place] for place in pair]
+        if terms[pair[0]].since != terms[pair[1]].since and all(
+            one.since and (one.until is None or one.since < one.until) for one in some
+        ):
+            yield exchanged
 
 
 def _of_best_score(

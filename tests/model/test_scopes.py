@@ -22,8 +22,10 @@ from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, conclude, study, study_to_json
 from model.study.judging import few_gain, find_end, split
 from model.study.parameters import ParameterVector, Term, copied
-from model.study.scope_search import most_promising
+from model.study.scope_search import ScopeSearch, most_promising
 from model.study.scopes import ScopeCandidate, Span, best_span, single_heliostat_scopes, time_scopes
+from model.study.selection import ForwardSelection, exchange_begins
+from model.study.trials import TrialFitter
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
 from tests.model.scenes import FIRST, photographs
@@ -369,6 +371,23 @@ def test_a_changed_camera_beside_haze_is_found_since_its_day():
     found = study_to_json(found_in(changed, "camera_response", "sun_shape"))["effects"]
     scopes = {effect["name"]: effect["scope"] for effect in found}
     assert scopes["camera_response"]["since"] == "2024-06-16"
+
+
+@pytest.mark.full
+def test_a_camera_that_was_changed_within_haze_has_its_own_day():
+    """What is found first may begin with the haze, and the haze with the camera."""
+    changed, hazy = date(2024, 6, 13), Since(date(2024, 6, 7), until=date(2024, 6, 19))
+    effects = [CameraShoulder(0.8, scope=Since(changed)), SunShapeEffect(0.15, scope=hazy)]
+    fitter = TrialFitter(photographs(effects), JUELICH_MODEL, StudyOptions())
+    selection = ForwardSelection(fitter, ScopeSearch(fitter))
+    camera, haze = (
+        Term(CameraShoulder, since=changed),
+        Term(SunShapeEffect, since=hazy.since, until=hazy.until),
+    )
+    wrong = [replace(camera, since=hazy.since), replace(haze, since=changed)]
+    exchanged = exchange_begins(selection, fitter.fit(wrong))
+    assert exchanged.parameters.terms == (camera, haze)
+    assert exchange_begins(selection, exchanged) is exchanged
 
 
 @pytest.mark.full
