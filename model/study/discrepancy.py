@@ -524,9 +524,11 @@ class _Search(_Sample):
         """Mean accuracy of photographs with an error (n, P) in shares of peaks."""
         return 1 - float((np.abs(left) * self.peaks[rows]).sum(axis=1).mean())
 
-    def linear(self, kind: GenericKind, rows: Rows, cuts: Array, amounts: Array) -> Linearised:
+    def linear(
+        self, model: GenericModel, kind: GenericKind, rows: Rows, cuts: Array, amounts: Array
+    ) -> Linearised:
         """The linear model of a kind at cuts (n, 64, 64) that have amounts (n, K) of it."""
-        values = self.model.derivatives(kind, rows, cuts, amounts)
+        values = model.derivatives(kind, rows, cuts, amounts)
         values = values.reshape(*amounts.shape, -1) / self.peaks[rows, None].astype(np.float32)
         is_fitted = self.is_fitted[rows]
         sizes = np.sqrt((values[is_fitted] ** 2).sum(axis=2).mean(axis=0)) + 1e-12
@@ -581,7 +583,7 @@ class _Search(_Sample):
         amounts if those are fast to find.
         """
         none = np.zeros((len(cuts), len(kind.components)))
-        point = self.linear(kind, self.fitted, cuts, none)
+        point = self.linear(self.model, kind, self.fitted, cuts, none)
         if kind.basis is None:
             return point
         term = GenericTerm(kind, None, kind.owners[0])
@@ -601,16 +603,17 @@ class _Search(_Sample):
             if accuracy <= best + MIN_PROGRESS:
                 break
             best = accuracy
-            found = Iterated(coefficients, self.linear(term.kind, rows, changed, amounts))
+            point = self.linear(self.model, term.kind, rows, changed, amounts)
+            found = Iterated(coefficients, point)
         return found
 
     def fit(self, choice: TermChoice, cuts: Array) -> FittedTerm:
         """Fit a chosen term, and apply it to all photographs."""
         term, design = choice.term, self.design(choice.term, self.all)
         found = self.iterate(term, choice.ridge, cuts[self.fitted], choice.point)
-        amounts = design.amounts(found.coefficients)
-        changed = self.model.apply(term.kind, self.all, cuts, amounts)
-        point = self.linear(term.kind, self.all, changed, amounts)
+        amounts, model = design.amounts(found.coefficients), self.model.of_kind(term.kind)
+        changed = model.apply(term.kind, self.all, cuts, amounts)
+        point = self.linear(model, term.kind, self.all, changed, amounts)
         return FittedTerm(choice, Regression(*point, design), changed, self.is_fitted)
 
     def transfer(self, found: Sequence[FittedTerm], groups: Sequence[object]) -> BeforeAfter | None:

@@ -6,6 +6,7 @@ as photographs are.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -67,6 +68,12 @@ class GenericModel:
         traced = [*(mirror_kinds(facets) if is_alike else []), SUN_SIZE]
         self.traces = TracedTerms(forecaster, self.aligned, self.view, traced)
         self.kinds = [*IMAGE_KINDS, *traced]
+
+    def of_kind(self, kind: GenericKind) -> "GenericModel":
+        """The same for one kind: it traces no others where it traces photographs first."""
+        model = copy(self)
+        model.traces = TracedTerms(self.forecaster, self.aligned, self.view, [kind])
+        return model
 
     def spots(self, rows: Rows, cuts: Array) -> SpotImages:
         """The geometry of some photographs with cuts (n, 64, 64)."""
