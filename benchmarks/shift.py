@@ -5,8 +5,8 @@ strong or weak, and fields without a fault. A robot takes the first action that 
 alarm, studies and their adoption included, until nothing is offered. Photographs of two further
 weeks, which the store never gets, judge each action: a copy of the store forecasts them before and
 after. The oracle is the same field with nothing but its changed mirrors, which were always so; its
-unseen photographs have the declared camera, too. Its surfaces of heliostats that have faults are
-refined, as the robot refines them.
+unseen photographs have the declared camera, too. Surfaces that a fault makes new are refined, as
+the robot refines them.
 
 ``results/shift.json`` is written after each field, so an interrupted run keeps what it has.
 """
@@ -70,6 +70,9 @@ SIZES = {
     "camera changed": (0.6, 0.85),  # power of the new camera's curve
 }
 OF_FIELD = ("hazy", "target moved", "camera changed")
+REMADE = ("facet canted", "no surface")
+"""Faults after which the twin makes another surface."""
+
 LASTING = ("facet canted", "drives stepped", "drifting", "target moved", "camera changed")
 
 
@@ -213,7 +216,7 @@ def work(runtime: Runtime) -> None:
 def fill(root: Path, store: Path, case: Case, *, oracle: bool = False) -> None:
     """Import a part, make surfaces and mounts, and receive the rest one by one.
 
-    The oracle refines surfaces of heliostats with faults, from all photographs.
+    The oracle refines the surfaces that the robot refines, from all photographs.
     """
     end = max(one.taken_at for one in case.photographs)
     begin, unseen = (end - timedelta(days=days) for days in (ARCHIVED, UNSEEN))
@@ -229,7 +232,9 @@ def fill(root: Path, store: Path, case: Case, *, oracle: bool = False) -> None:
         work(runtime)
         write(root, case, newer)
         give(runtime, root, newer)
-        faulty = sorted({name for one in case.faults for name in one.heliostats})
+        faulty = sorted(
+            {name for one in case.faults if one.kind in REMADE for name in one.heliostats}
+        )
         if oracle and faulty:
             refined = {"heliostats": faulty, "method": "refined"}
             sent(client, "POST", "/v1/jobs/predictions", refined)

@@ -67,8 +67,7 @@ def find_drifts(fitter: TrialFitter, trial: Trial) -> list[Term]:
     fit.take_off_grid(parameters, trial.values)
     residuals = fit.residuals(parameters, trial.values)
     halves, found = list(_halves(fitter)), []
-    is_estimated = all(p.is_estimated for p in fitter.flux_images)
-    least = MIN_DRIFT_ESTIMATED if is_estimated else MIN_DRIFT
+    least = MIN_DRIFT_ESTIMATED if fitter.is_estimated else MIN_DRIFT
     for term in parameters.terms:
         own = np.array([u.term == term for u in parameters.all])
         away = np.where(own, trial.values - parameters.neutral, 0.0)

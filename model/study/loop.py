@@ -15,7 +15,7 @@ from model.study.halves import find_drifts
 from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
 from model.study.parameters import Term
 from model.study.scope_search import ScopeSearch
-from model.study.selection import ForwardSelection, exchange_begins
+from model.study.selection import ForwardSelection, exchange_begins, prune_redundant
 from model.study.trials import StudyOptions, Trial, TrialFitter
 
 MIN_IMAGES = 4
@@ -91,7 +91,7 @@ def study(
             else choice.gain
         )
         found[dated] = Found(term.kind.name, choice.gain, shape, _names(term, choice.lookalikes))
-        current = selection.prune_redundant(fitter.forecast(trial) if dated != term else trial)
+        current = prune_redundant(selection, fitter.forecast(trial) if dated != term else trial)
         terms = current.parameters.terms
         current = exchange_begins(selection, current)
         renamed = dict(zip(terms, current.parameters.terms, strict=True))

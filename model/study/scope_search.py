@@ -59,6 +59,10 @@ class ScopeSearch:
         """Whether an effect acts in its longest scope, at all heliostats."""
         return term == self.full_scope(term.kind)
 
+    def is_shared_since(self, term: Term) -> bool:
+        """Whether an effect of all heliostats began on a day that was searched."""
+        return bool(term.since) and term.heliostats is None and not self.has_full_scope(term)
+
     def fit_scopes(self, trials: dict[Term, Trial], current: Trial) -> dict[Term, Trial]:
         """Fit effects in the most promising limited scopes."""
         fitter = self.fitter

@@ -51,6 +51,11 @@ MIN_MOVEMENT = 0.5
 MIN_DISTINCTION = 0.001
 """Smallest gain of one effect over another that distinguishes them."""
 
+DATED = 0.5
+"""Share of the least gain that is enough for an effect with a date where surfaces are estimates:
+what they and the model leave is there before and after it.
+"""
+
 SIMPLER, MOST = 4, 2 / 3
 """How many times fewer values than one by day an effect must have, and the share of its gain, to go
 before it. Values for each day also absorb what is another effect's.
@@ -150,10 +155,12 @@ class ForwardSelection:
 
     def is_worthwhile(self, term: Term, gain: Gain) -> bool:
         """Whether a gain by an effect is significant and large enough."""
-        is_single = term.is_permanent and term.heliostats is not None
-        return gain.low > 0 and gain.mean >= max(
-            MIN_SINGLE_GAIN if is_single else 0.0, self.options.min_gain
-        )
+        least = self.options.min_gain
+        if term.is_permanent and term.heliostats is not None:
+            least = max(least, MIN_SINGLE_GAIN)
+        elif self.fitter.is_estimated and self.scopes.is_shared_since(term):
+            least *= DATED
+        return gain.low > 0 and gain.mean >= least
 
     def choose(self, trials: dict[Term, Trial], current: Trial) -> Choice | None:
         """Choose the candidate to add: the simplest of those that are not distinguished from the
@@ -207,14 +214,15 @@ class ForwardSelection:
             differences[half] = (best.score - current.score)[half]
         return paired_gain(differences, self.heliostats)
 
-    def prune_redundant(self, current: Trial) -> Trial:
-        """Remove effects that are no longer worthwhile beside a later one."""
-        for term in current.parameters.terms[:-1]:
-            rest = [other for other in current.parameters.terms if other != term]
-            reduced = self.fitter.fit(rest, current)
-            if not self.is_worthwhile(term, self.gain_where_acting(term, current, reduced)):
-                current = reduced
-        return current
+
+def prune_redundant(selection: ForwardSelection, current: Trial) -> Trial:
+    """Remove effects that are no longer worthwhile beside a later one."""
+    for term in current.parameters.terms[:-1]:
+        rest = [other for other in current.parameters.terms if other != term]
+        reduced = selection.fitter.fit(rest, current)
+        if not selection.is_worthwhile(term, selection.gain_where_acting(term, current, reduced)):
+            current = reduced
+    return current
 
 
 def exchange_begins(selection: ForwardSelection, current: Trial) -> Trial:
@@ -237,11 +245,7 @@ def exchange_begins(selection: ForwardSelection, current: Trial) -> Trial:
 
 def _begins_exchanged(terms: Sequence[Term], scopes: ScopeSearch) -> Iterator[list[Term]]:
     """The same effects with the begins of two of all heliostats exchanged."""
-    places = [
-        place
-        for place, one in enumerate(terms)
-        if one.since and one.heliostats is None and not scopes.has_full_scope(one)
-    ]
+    places = [place for place, one in enumerate(terms) if scopes.is_shared_since(one)]
     for pair in combinations(places, 2):
         exchanged = list(terms)
         for place, other in (pair, pair[::-1]):

@@ -110,6 +110,7 @@ class TrialFitter:
         mounts = [p.setup.heliostat.mount for p in flux_images]
         unseen = {(name, p) for name, kind in CATALOGUE.items() for p in kind.unseen(mounts)}
         self.unknowns = ParameterVector((), tuple(facets), frozenset(unseen))
+        self.is_estimated = all(p.is_estimated for p in flux_images)
         self.days = days_of(flux_images)
         self.heliostats = np.array([p.heliostat for p in flux_images])
         self.judged_heliostats = self.heliostats[self.split.held_out]

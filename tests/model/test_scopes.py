@@ -20,7 +20,7 @@ from model.errors import InvalidInputError
 from model.forecast import View, align
 from model.plant_model import JUELICH_MODEL
 from model.study import Study, StudyOptions, conclude, study, study_to_json
-from model.study.judging import few_gain, find_end, split
+from model.study.judging import Gain, few_gain, find_end, split
 from model.study.parameters import ParameterVector, Term, copied
 from model.study.scope_search import ScopeSearch, most_promising
 from model.study.scopes import ScopeCandidate, Span, best_span, single_heliostat_scopes, time_scopes
@@ -371,6 +371,18 @@ def test_a_changed_camera_beside_haze_is_found_since_its_day():
     found = study_to_json(found_in(changed, "camera_response", "sun_shape"))["effects"]
     scopes = {effect["name"]: effect["scope"] for effect in found}
     assert scopes["camera_response"]["since"] == "2024-06-16"
+
+
+@pytest.mark.parametrize("is_estimated", [True, False])
+def test_a_dated_effect_may_gain_less_where_surfaces_are_estimates(is_estimated: bool):
+    """What they leave is there before and after its day."""
+    taken = [replace(p, is_estimated=is_estimated) for p in photographs(days=2)]
+    fitter = TrialFitter(taken, JUELICH_MODEL, StudyOptions())
+    selection, small = ForwardSelection(fitter, ScopeSearch(fitter)), Gain(0.003, 0.001, 0.005, 3.0)
+    dated = Term(CameraShoulder, since=CHANGE)
+    assert selection.is_worthwhile(dated, small) == is_estimated
+    assert not selection.is_worthwhile(Term(CameraShoulder), small)
+    assert not selection.is_worthwhile(replace(dated, heliostats=("far",)), small)
 
 
 @pytest.mark.full
