@@ -490,21 +490,25 @@ def calibration(records: Sequence[Record]) -> Iterator[str]:
     yield f"{len(true)} sets with the true effect first, {len(outside)} with it taken out"
     yield "| largest share left | true names kept [%] | wrong names [%] |"
     yield "| --- | --- | --- |"
-    for share in SHARES_LEFT:
-        kept = [r["unexplained"] <= share and not r["contradicted_by"] for r in true]
-        wrong = [
-            bool(r["found"]) and r["unexplained"] <= share and not r["contradicted_by"]
-            for r in outside
-        ]
+
+    def is_named(record: Record, share: float | None) -> bool:
+        if share is None:
+            return bool(record["verdict"] == "effect")
+        leaves_little = record["unexplained"] <= share and not record["contradicted_by"]
+        return bool(record["found"]) and leaves_little
+
+    for share in (*SHARES_LEFT, None):
+        kept, wrong = ([is_named(r, share) for r in some] for some in (true, outside))
+        name = "as studies decide" if share is None else f"{share:.2f}"
         log_row(
             "Thresholds of the verdict, by effects that are taken out of the catalogue",
-            f"{share:.2f}",
+            name,
             {
                 "true names kept [%]": proportion(sum(kept), len(kept)) if kept else None,
                 "wrong names [%]": proportion(sum(wrong), len(wrong)) if wrong else None,
             },
         )
-        yield f"| {share:.2f} | {percent(kept)} | {percent(wrong)} |"
+        yield f"| {name} | {percent(kept)} | {percent(wrong)} |"
 
 
 def log_summary(

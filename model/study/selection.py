@@ -246,13 +246,13 @@ def exchange_begins(selection: ForwardSelection, current: Trial) -> Trial:
 def _begins_exchanged(terms: Sequence[Term], scopes: ScopeSearch) -> Iterator[list[Term]]:
     """The same effects with the begins of two of all heliostats exchanged."""
     places = [place for place, one in enumerate(terms) if scopes.is_shared_since(one)]
-    for pair in combinations(places, 2):
-        exchanged = list(terms)
-        for place, other in (pair, pair[::-1]):
-            exchanged[place] = replace(terms[place], since=terms[other].since)
-        some = [exchanged[place] for place in pair]
-        if terms[pair[0]].since != terms[pair[1]].since and all(
-            one.since and (one.until is None or one.since < one.until) for one in some
+    for first, second in combinations(places, 2):
+        pairs = (first, second), (second, first)
+        changed = {place: replace(terms[place], since=terms[other].since) for place, other in pairs}
+        exchanged = [changed.get(place, one) for place, one in enumerate(terms)]
+        if exchanged != list(terms) and all(
+            one.until is None or (one.since is not None and one.since < one.until)
+            for one in exchanged
         ):
             yield exchanged
 

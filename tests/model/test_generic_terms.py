@@ -89,7 +89,10 @@ def test_strengths_differ_by_more_than_their_deviations():
     apart = Strength(1.4, 0.05, 8), Strength(0.6, 0.05, 8)
     tiny = Strength(1.01, 0.001, 8), Strength(0.99, 0.001, 8)
     assert p_equal(*alike) > LEVEL > p_equal(*apart)
-    assert p_equal(*tiny) == p_equal(*apart, least=MIN_DRIFT_ESTIMATED + 0.5) == 1
+    assert p_equal(*tiny) == 1
+    near_and_far = Strength(0.86, 0.04, 8), Strength(1.18, 0.04, 8)  # by estimated surfaces
+    assert p_equal(*near_and_far) < LEVEL
+    assert p_equal(*near_and_far, MIN_DRIFT_ESTIMATED) == 1
 
 
 def term(kind: str, scaling: str | None) -> GenericTerm:
