@@ -4,9 +4,9 @@ The demonstration's generator makes fields over eight weeks with every kind of f
 strong or weak, and fields without a fault. A robot takes the first action that REST offers for each
 alarm, studies and their adoption included, until nothing is offered. Photographs of two further
 weeks, which the store never gets, judge each action: a copy of the store forecasts them before and
-after. The oracle is the same field with nothing but its changed mirrors, which were always so; its
-unseen photographs have the declared camera, too. Surfaces that a fault makes new are refined, as
-the robot refines them.
+after. The oracle is the same field with nothing but its changed mirrors, which were always so, and
+its changed camera, whose exact curve decodes its photographs. Surfaces that a fault makes new are
+refined, as the robot refines them.
 
 ``results/shift.json`` is written after each field, so an interrupted run keeps what it has.
 """
@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
@@ -31,6 +31,7 @@ from unittest import mock
 
 import numpy as np
 from fastapi.testclient import TestClient
+from numpy.typing import NDArray
 
 from benchmarks.record import log_row, proportion, recording
 from heliotwin.demo import field as demo_field
@@ -90,7 +91,8 @@ def make_case(
 ) -> Case:
     """Plan a field with strong (0), weak (1) or no faults (None).
 
-    For the oracle, mirrors that change have always been so, and nothing else is wrong.
+    For the oracle, mirrors that change have always been so. Nothing else is wrong but the camera,
+    whose curve the oracle knows (`write`).
     """
     now = datetime.now(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     rng = np.random.default_rng(seed)
@@ -99,7 +101,11 @@ def make_case(
     plant = replace(whole, heliostats={name: whole.heliostats[name] for name in sorted(names)})
     faults = () if strength is None else tuple(_faults(rng, names, strength))
     acting = (
-        [replace(fault, days=(DAYS, 0)) for fault in faults if fault.kind == "facet canted"]
+        [
+            fault if fault.kind == "camera changed" else replace(fault, days=(DAYS, 0))
+            for fault in faults
+            if fault.kind in ("camera changed", "facet canted")
+        ]
         if oracle
         else list(faults)
     )
@@ -154,8 +160,13 @@ def _faults(rng: np.random.Generator, names: Sequence[str], strength: int) -> It
             yield Fault(kind, (next(free),), (begin, end), sizes[strength])
 
 
-def write(root: Path, case: Case, photographs: Sequence[PlannedPhotograph]) -> None:
-    """Write photographs into the folder; those of another camera or a moved target apart."""
+def write(
+    root: Path, case: Case, photographs: Sequence[PlannedPhotograph], *, oracle: bool = False
+) -> None:
+    """Write photographs into the folder; those of another camera or a moved target apart.
+
+    For the oracle, counts of another camera are straightened. Their noise remains.
+    """
     for moved in (False, True):
         for camera in (False, True):
             some = [
@@ -176,8 +187,19 @@ def write(root: Path, case: Case, photographs: Sequence[PlannedPhotograph]) -> N
                     },
                 )
             power = some[0].faults["camera changed"] if camera else 1.0
-            with mock.patch.object(demo_field, "Srgb", lambda power=power: _Bent(power)):
+            draw = _straight(power) if oracle else demo_field._draw
+            with (
+                mock.patch.object(demo_field, "Srgb", lambda power=power: _Bent(power)),
+                mock.patch.object(demo_field, "_draw", draw),
+            ):
                 demo_field.write_photographs(root, plant, some)
+
+
+def _straight(power: float) -> Callable[..., NDArray[np.uint8]]:
+    """Draws photographs whose counts get the inverse of a power."""
+    draw, counts = demo_field._draw, np.arange(256) / 255
+    straightened = np.round(255 * counts ** (1 / power)).astype(np.uint8)
+    return lambda light, rng: straightened[draw(light, rng)]
 
 
 @dataclass(frozen=True)
@@ -223,14 +245,14 @@ def fill(root: Path, store: Path, case: Case, *, oracle: bool = False) -> None:
     older = [one for one in case.photographs if one.taken_at < begin]
     newer = [one for one in case.photographs if begin <= one.taken_at < unseen]
     lacking = {name for one in case.faults if one.kind == "no surface" for name in one.heliostats}
-    write(root, case, older)
+    write(root, case, older, oracle=oracle)
     with service_on(store) as (client, runtime):
         import_folder(runtime, read_folder(root, sorted(case.plant.heliostats)), actor="robot")
         names = sorted(set(case.plant.heliostats) - lacking)
         sent(client, "POST", "/v1/jobs/predictions", {"heliostats": names, "images": 8})
         sent(client, "POST", "/v1/jobs/calibrations", {})
         work(runtime)
-        write(root, case, newer)
+        write(root, case, newer, oracle=oracle)
         give(runtime, root, newer)
         faulty = sorted(
             {name for one in case.faults if one.kind in REMADE for name in one.heliostats}
@@ -509,9 +531,9 @@ def _try_field(root: Path, options: argparse.Namespace, seed: int, word: str) ->
     )
     ideal = make_case(root / "ideal", *size, oracle=True)
     fill(root / "ideal", root / "oracle", ideal, oracle=True)
-    as_meant = [one for one in ideal.photographs if one.taken_at >= end - timedelta(days=UNSEEN)]
-    write(root / "ideal", ideal, as_meant)
-    best = judge(root / "oracle", root / "ideal", as_meant)
+    known = [one for one in ideal.photographs if one.taken_at >= end - timedelta(days=UNSEEN)]
+    write(root / "ideal", ideal, known, oracle=True)
+    best = judge(root / "oracle", root / "ideal", known)
     gain = mean(ended.values()) - mean(begun.values())
     gap = mean(best.values()) - mean(ended.values())
     for name in sorted(ended, key=lambda one: ended[one] - best.get(one, 0.0))[:MOST_BELOW]:
