@@ -2,8 +2,7 @@
 
 The six sets of ``../shared/undeclared``; the real plant (AA39, AC43), studied as a folder and by
 leaving out one image at a time, with measured surfaces and with predicted ones; and what the effect
-found buys where it matters: surfaces refined with it against deflectometry. With ``--pictures DIR``
-it draws the real plant before and after.
+found buys where it matters: surfaces refined with it against deflectometry.
 """
 
 import argparse
@@ -14,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from benchmarks import data_folder
 from benchmarks.folders import read_observations, read_photographs
@@ -126,34 +124,6 @@ def row(label: str, study: Study) -> str:
         compared_with="measured flux images",
     )
     return f"| {label} | {report['verdict']} | {found} | {before:.3f} | {after:.3f} | {share:.2f} |"
-
-
-def picture(study: Study) -> Figure:
-    """Every held-out image: as measured, as forecast before and after, and both residuals, in
-    shares of its peak.
-    """
-    order = np.argsort(study.accuracy_before)
-    figure = Figure(figsize=(11, 2.1 * len(order)), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(order), 5))
-    for axes, index in zip(grid, order, strict=True):
-        peak = study.measured[index].max()
-        measured, before, after = (
-            cuts[index] / peak for cuts in (study.measured, study.before, study.after)
-        )
-        shown = {
-            study.images[index].key: measured,
-            f"before: {study.accuracy_before[index]:.3f}": before,
-            f"after: {study.accuracy_after[index]:.3f}": after,
-            "difference before": before - measured,
-            "difference after": after - measured,
-        }
-        for ax, (title, image) in zip(axes, shown.items(), strict=True):
-            signed = title.startswith("difference")
-            low, high = (-0.3, 0.3) if signed else (0.0, 1.0)
-            ax.imshow(image, cmap="RdBu_r" if signed else "inferno", vmin=low, vmax=high)
-            ax.set_title(title, fontsize=9)
-            ax.set_axis_off()
-    return figure
 
 
 def left_out(photographs: Sequence[FluxImage], kinds: tuple[str, ...], window: float) -> np.ndarray:
@@ -360,11 +330,8 @@ def surfaces(root: Path, simulated: int) -> None:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--only", choices=("studies", "plant", "surfaces", "pictures"), help="one part of it"
-    )
+    parser.add_argument("--only", choices=("studies", "plant", "surfaces"), help="one part of it")
     parser.add_argument("--simulated", type=int, default=8, help="held-out surfaces to refine")
-    parser.add_argument("--pictures", type=Path, help="a folder to draw real-plant.png into")
     arguments = parser.parse_args()
     root = data_folder()
     if not root.is_dir():
@@ -379,9 +346,6 @@ def main() -> None:
         if arguments.only in (None, name):
             with recording(f"closed-loop-{name}"):
                 part()
-    if arguments.pictures is not None:
-        arguments.pictures.mkdir(parents=True, exist_ok=True)
-        picture(real_study(root)).savefig(arguments.pictures / "real-plant.png", dpi=50)
 
 
 if __name__ == "__main__":

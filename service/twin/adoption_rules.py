@@ -90,13 +90,14 @@ def is_ambiguous(findings: StudyFindings) -> bool:
     Of two that only images of targets show, either will do, and of two that ended.
     """
     return any(
-        not (_is_of_images(effect["name"]) and _is_of_images(other))
+        not (is_of_images(effect["name"]) and is_of_images(other))
         for effect in findings.effects
         if not (effect.get("scope") or {}).get("until")
         for other in effect.get("lookalikes", ())
     )
 
 
-def _is_of_images(name: str) -> bool:
+def is_of_images(name: str) -> bool:
+    """Whether only images of targets show an effect; false for one that is not loaded."""
     kind = CATALOGUE.get(name)
     return kind is not None and kind.stage == "image"

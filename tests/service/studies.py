@@ -1,5 +1,6 @@
 """Studies that somebody made, and versions of the model that adopt them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from service import store
@@ -36,13 +37,18 @@ def report_of(*effects: dict[str, Any], verdict: str = "effect") -> dict[str, An
     }
 
 
-def study_row(*effects: dict[str, Any], model: int = 1, verdict: str | None = None) -> StudyRow:
-    """A study of AA39 that found these effects."""
+def study_row(
+    *effects: dict[str, Any],
+    model: int = 1,
+    verdict: str | None = None,
+    heliostats: Sequence[str] = ("AA39",),
+) -> StudyRow:
+    """A study of ``heliostats`` that found these effects."""
     verdict = verdict or ("effect" if effects else "none")
     return StudyRow(
         created_by="tester",
         options={},
-        heliostats=["AA39"],
+        heliostats=list(heliostats),
         model=model,
         model_version=f"{model}:",
         verdict=verdict,

@@ -23,7 +23,6 @@ from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session
 
 from model.changes import LevelChange, find_changes
-from model.effects import CATALOGUE
 from model.pointing.report import clock_in_words
 from model.times import format_minute
 from service.base.fields import From
@@ -45,6 +44,7 @@ from service.store.tables import (
     SurfaceRow,
 )
 from service.twin import model_versions
+from service.twin.adoption_rules import is_of_images
 from service.twin.alarms import offers
 from service.twin.alarms.field_fall import LEAST, find_field_fall
 from service.twin.alarms.field_overview import ActiveSurface, HeliostatOverview, read_marks
@@ -567,19 +567,20 @@ def _outdated_aims(
 
 
 def _camera(session: Session) -> Iterator[Alarm]:
-    """Find camera changes in the newest study, and newly declared cameras.
+    """Find camera changes in the newest study of several heliostats, and newly declared cameras.
 
-    The study does not count if it is adopted.
+    The study does not count if it is adopted. That of one heliostat says nothing about the camera.
     """
     study = session.execute(
-        select(StudyRow.id, StudyRow.created_at, StudyRow.report["effects"])
+        select(StudyRow.id, StudyRow.report["effects"])
+        .where(func.json_array_length(StudyRow.heliostats) > 1)
         .order_by(StudyRow.id.desc())
         .limit(1)
     ).one_or_none()
     if study is not None and model_versions.find_adopted(session, study.id) is None:
-        for effect in study[2] or ():
+        for effect in study[1] or ():
             scope = effect.get("scope") or {}
-            if scope.get("kind") == "since" and CATALOGUE[effect["name"]].stage == "image":
+            if scope.get("kind") == "since" and is_of_images(effect["name"]):
                 name, day = effect["name"], scope["since"]
                 yield Alarm(
                     "camera",

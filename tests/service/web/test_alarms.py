@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from datetime import UTC, date, datetime, timedelta
+from functools import partial
 from html import unescape
 from pathlib import Path
 from typing import Any, get_args
@@ -304,20 +305,23 @@ def test_camera_that_a_study_found_changed_until_that_is_adopted(app: FastAPI, c
         "name": "camera_blur",
         "parameters": {"sigma_m": {"value": 0.1, "ci95": [0.08, 0.12], "unit": "m"}},
     }
+    of_both = partial(study_row, heliostats=["AA39", "AB01"])
     with app.state.runtime.database.writing() as session:
         number = store.add_study(
-            session, study_row(SLOPE | {"scope": since}, blur | {"scope": since})
+            session, of_both(SLOPE | {"scope": since}, blur | {"scope": since})
         ).id
+        other = blur | {"parameters": {}, "scope": since | {"since": "2024-06-09"}}
+        store.add_study(session, study_row(other))  # of one heliostat: nothing about the camera
     (item,) = items(client)
     assert item["message"] == f"study {number} found camera blur in photographs from 2024-06-02 on"
     assert (item["heliostat"], item["since"]) == (None, "2024-06-02T00:00:00Z")
     acknowledge(client, item)
     with app.state.runtime.database.writing() as session:
-        store.add_study(session, study_row(blur | {"scope": since}))
+        number = store.add_study(session, of_both(blur | {"scope": since})).id
     assert [one["acknowledged_by"] for one in items(client)] == [
         "local"
     ]  # found again: the same reason
-    assert client.post(f"/v1/studies/{number + 1}/adopt", json={}).status_code < 300
+    assert client.post(f"/v1/studies/{number}/adopt", json={}).status_code < 300
     assert items(client) == []
 
 
