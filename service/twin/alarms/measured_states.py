@@ -1,9 +1,9 @@
 """Measure the states of mirrors in operation by photographs: lost light, and pointing errors.
 
 A heliostat may send less light than before, compared with the others on the same days. The light of
-a photograph depends on the heliostat, on the day (haze, exposure) and on what changed on the
-mirror. Medians of heliostats and of days are removed in turn (Tukey 1977, *Exploratory Data
-Analysis*, chapter 11), so that a change of one heliostat is left.
+a photograph per cosine of incidence depends on the heliostat, on the day (haze, exposure) and on
+what changed on the mirror. Medians of heliostats and of days are removed in turn (Tukey 1977,
+*Exploratory Data Analysis*, chapter 11), so that a change of one heliostat is left.
 """
 
 import math

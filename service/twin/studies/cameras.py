@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from datetime import time as clock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 from zoneinfo import ZoneInfo
 
@@ -22,10 +22,11 @@ import numpy as np
 from cachetools import TTLCache
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
-from sqlalchemy import func, select
+from sqlalchemy import Row, func, select
 from sqlalchemy.orm import Session
 
 from model.camera_choice import CameraChoice, PhotographedMirror, choose_camera
+from model.frames import sun_direction
 from model.plant_model import PlantModel
 from service import store
 from service.base.settings import Settings
@@ -64,7 +65,10 @@ _OF_DEVIATION, _OF_MEDIAN = 1.4826, 1.2533
 
 
 class LightReading(NamedTuple):
-    """Light of a photograph: the logarithm of the spot over the sheet. ``day`` is the plant's."""
+    """Light of a photograph: the logarithm of the spot over the sheet and the cosine of incidence.
+
+    ``day`` is the plant's.
+    """
 
     heliostat: int
     target: str
@@ -131,23 +135,36 @@ def find_camera_change(target: str, daily: Daily, settings: Settings) -> CameraC
 def _of_day(session: Session, day: date, zone: str) -> _DayFigures:
     """Figures of a day in a time ``zone``, over its last accepted photographs."""
     begin = datetime.combine(day, clock(), ZoneInfo(zone))
-    row = MeasurementRow
-    query = select(row.heliostat_id, TargetRow.name, row.taken_at, row.kind, row.quality)
-    query = query.join(TargetRow, TargetRow.id == row.target_id).where(
-        row.accepted, row.taken_at >= begin, row.taken_at < begin + timedelta(days=1)
+    row, mirror = MeasurementRow, HeliostatRow
+    query = (
+        select(row.heliostat_id, row.taken_at, row.kind, row.quality)
+        .add_columns(row.sun_azimuth_deg, row.sun_elevation_deg, TargetRow.name, TargetRow.geometry)
+        .add_columns(mirror.east_m, mirror.north_m, mirror.up_m)
+        .join(TargetRow, TargetRow.id == row.target_id)
+        .join(mirror, mirror.id == row.heliostat_id)
+        .where(row.accepted, row.taken_at >= begin, row.taken_at < begin + timedelta(days=1))
+        .order_by(row.taken_at.desc(), row.id.desc())
+        .limit(_MAX_A_DAY)
     )
     found: dict[str, list[list[float]]] = defaultdict(list)
     light = []
-    for heliostat, name, taken_at, kind, quality in session.execute(
-        query.order_by(row.taken_at.desc(), row.id.desc()).limit(_MAX_A_DAY)
-    ):
-        figures = [quality.get(figure) or 0.0 for figure in FIGURES]
+    for one in session.execute(query):
+        figures = [one.quality.get(figure) or 0.0 for figure in FIGURES]
         if min(figures) > 0:
-            found[name].append(figures)
-            if kind in _WITH_SHEET:
-                light.append(LightReading(heliostat, name, taken_at, day, math.log(figures[0])))
+            found[one.name].append(figures)
+            if one.kind in _WITH_SHEET:
+                value = math.log(figures[0] / _cosine(one))
+                light.append(LightReading(one.heliostat_id, one.name, one.taken_at, day, value))
     medians = {name: np.median(np.log(figures), axis=0) for name, figures in found.items()}
     return _DayFigures(medians, light)
+
+
+def _cosine(photograph: Row[Any]) -> float:
+    """Cosine of incidence on the mirror, by its place, its target and the sun."""
+    position = photograph.east_m, photograph.north_m, photograph.up_m
+    to_target = np.subtract(photograph.geometry["center"], position)
+    sun = sun_direction(photograph.sun_azimuth_deg, photograph.sun_elevation_deg)
+    return float(np.sqrt((1 + sun @ to_target / np.linalg.norm(to_target)) / 2))
 
 
 class CameraReadings(NamedTuple):

@@ -1,5 +1,6 @@
 """A camera that changed is seen in its photographs, and clouds are not taken for it."""
 
+from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
@@ -7,13 +8,14 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from numpy.linalg import norm
 from sqlalchemy import event
 
 from service import store
 from service.base.settings import Settings
 from service.store.columns import now
 from service.store.tables import ImageRow, MeasurementRow
-from service.twin.studies.cameras import FIGURES, find_camera_change
+from service.twin.studies.cameras import FIGURES, CameraWatch, find_camera_change
 from tests.service.web.pages import HTML
 
 SETTINGS = Settings()
@@ -65,25 +67,52 @@ def kept(app: FastAPI, changed: int) -> None:
     otherwise.
     """
     rng, at = np.random.default_rng(6), now().replace(hour=11) - timedelta(days=30)
+    for number in range(120):
+        quality = dict(zip(FIGURES, np.exp(rng.normal((0.8, 5.5, -3.6), SPREAD)), strict=True))
+        quality["sheet_share"] *= 3.0 if number // 4 >= 30 - changed else 1.0
+        keep(app, number, "flux", quality, at + timedelta(days=number // 4, minutes=number % 4))
+
+
+def keep(
+    app: FastAPI,
+    number: int,
+    kind: str,
+    quality: dict[str, Any],
+    taken_at: datetime,
+    sun: Sequence[float] = (180.0, 40.0),
+) -> None:
+    """A photograph of AA39 on the lower target, under a sun at an azimuth and elevation [deg]."""
     with app.state.runtime.database.writing() as session:
         heliostat, target = store.get_heliostat(session, "AA39"), store.get_target(session, "lower")
-        for number in range(120):
-            quality = dict(zip(FIGURES, np.exp(rng.normal((0.8, 5.5, -3.6), SPREAD)), strict=True))
-            quality["sheet_share"] *= 3.0 if number // 4 >= 30 - changed else 1.0
-            known: dict[str, Any] = {
-                "kind": "flux",
-                "target_id": target.id,
-                "accepted": True,
-                "quality": quality,
-            }
-            sun = {"sun_azimuth_deg": 180.0, "sun_elevation_deg": 40.0}
-            image = {"sha256": f"{number:03x}" + 61 * "0", "media_type": "image/png"}
-            row = MeasurementRow(
-                **known, **sun, taken_at=at + timedelta(days=number // 4, minutes=number % 4)
-            )
-            store.add_measurement(
-                session, heliostat, ImageRow(**image, size_bytes=1, width_px=1, height_px=1), row
-            )
+        row = MeasurementRow(
+            kind=kind,
+            target_id=target.id,
+            accepted=True,
+            quality=quality,
+            sun_azimuth_deg=sun[0],
+            sun_elevation_deg=sun[1],
+            taken_at=taken_at,
+        )
+        image = {"sha256": f"{number:03x}" + 61 * "0", "media_type": "image/png"}
+        store.add_measurement(
+            session, heliostat, ImageRow(**image, size_bytes=1, width_px=1, height_px=1), row
+        )
+
+
+@pytest.mark.usefixtures("client")
+def test_light_is_per_cosine_of_incidence(app: FastAPI):
+    database = app.state.runtime.database
+    with database.reading() as session:
+        row, target = store.get_heliostat(session, "AA39"), store.get_target(session, "lower")
+        way = np.subtract(target.geometry["center"], (row.east_m, row.north_m, row.up_m))
+    towards = np.degrees(np.arctan2(way[0], way[1])), np.degrees(np.arcsin(way[2] / norm(way)))
+    aside = towards[0] + 90, 0.0  # at a right angle: an incidence of 45 degrees
+    at = now() - timedelta(hours=1)
+    for number, (sun, share) in enumerate(((towards, 1.0), (aside, 0.5**0.5))):
+        keep(app, number, "raw", dict.fromkeys(FIGURES, 2.0 * share), at, sun)
+    with database.reading() as session:
+        light = CameraWatch().read(session, SETTINGS).light
+    assert [one.light for one in light] == pytest.approx([np.log(2.0)] * 2)
 
 
 def of_camera(client: TestClient) -> list[dict[str, Any]]:
