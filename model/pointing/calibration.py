@@ -23,7 +23,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.pointing.drives import ConditionedModel, Noise, Posterior, infer_changes, unknown_steps
+from model.pointing.drives import (
+    ConditionedModel,
+    LinearModel,
+    Noise,
+    Posterior,
+    infer_changes,
+    unknown_steps,
+)
 from model.pointing.kinematics import (
     ANOTHER_KIND_M,
     PARAMETERS,
@@ -240,10 +247,9 @@ def calibrated_batches(kinds: Sequence[Kind], readings: Readings) -> Iterator[Ba
             )
             parameters, zeros = posterior.parameters, posterior.zeros[:, : selected.used.shape[1]]
             y, slope = linearise(chain, selected, parameters, zeros)
-            prior = done.prior
-            model = ConditionedModel.of(
-                y, slope, selected, prior.mean, prior.covariance, done.noise, posterior
-            )
+            mean, cov, steps = done.prior.mean, done.prior.covariance, unknown_steps(posterior)
+            linear = LinearModel.of(y, slope, selected, mean, cov, done.noise, steps)
+            model = ConditionedModel.of(linear, posterior)
             yield Batch(rows[batch], chain, selected, parameters, zeros, model)
 
 

@@ -176,7 +176,7 @@ def infer_changes(
         Of the zeros of measurements of an unknown time, in addition to drift and jitter; 0 by
         default.
     """
-    model = _LinearModel.of(y, jacobian, readings, prior_mean, prior_cov, noise, undated_variance)
+    model = LinearModel.of(y, jacobian, readings, prior_mean, prior_cov, noise, undated_variance)
     changes = _Changes.empty(*readings.used.shape)
     active = np.arange(len(y))
     while len(active):
@@ -189,7 +189,7 @@ def infer_changes(
 
 
 @dataclass(frozen=True, eq=False)
-class _LinearModel:
+class LinearModel:
     """The Gaussian model without steps and foreign spots; N = 2 M.
 
     ``y`` (H, N) less the prior's mean; ``by_parameter`` (H, N, P) is J; ``by_zero`` (H, M, 2, 2) is
@@ -218,7 +218,8 @@ class _LinearModel:
         cov: Array,
         noise: Noise,
         undated_variance: Array | None = None,
-    ) -> "_LinearModel":
+    ) -> "LinearModel":
+        """The model of `infer_changes`, with its arguments."""
         heliostats, most, _, count = jacobian.shape
         by_parameter = jacobian.reshape(heliostats, 2 * most, count)
         by_zero = jacobian[..., ZEROS]
@@ -242,7 +243,7 @@ class _LinearModel:
             target, by_parameter, by_zero, precision, log_det, readings, mean, cov, noise, variance
         )
 
-    def rows(self, rows: NDArray[np.intp]) -> "_LinearModel":
+    def rows(self, rows: NDArray[np.intp]) -> "LinearModel":
         """Select some heliostats."""
         if len(rows) == len(self.y):
             return self
@@ -360,27 +361,15 @@ class LeftOutErrors(NamedTuple):
 class ConditionedModel:
     """The linear model with inferred changes, for further questions to the data."""
 
-    model: _LinearModel
+    model: LinearModel
     changes: "_Changes"
 
     @classmethod
-    def of(
-        cls,
-        y: Array,
-        jacobian: Array,
-        readings: Readings,
-        mean: Array,
-        cov: Array,
-        noise: Noise,
-        posterior: Posterior,
-    ) -> "ConditionedModel":
-        """Build it with the arguments of `infer_changes` and its ``posterior``."""
-        most = readings.used.shape[1]
-        changes = _Changes.from_masks(posterior.stepped[:, :most], posterior.foreign[:, :most])
-        return cls(
-            _LinearModel.of(y, jacobian, readings, mean, cov, noise, unknown_steps(posterior)),
-            changes,
-        )
+    def of(cls, model: LinearModel, posterior: Posterior) -> "ConditionedModel":
+        """The model with the changes of a ``posterior``, which may be padded further."""
+        most = model.readings.used.shape[1]
+        stepped, foreign = posterior.stepped[:, :most], posterior.foreign[:, :most]
+        return cls(model, _Changes.from_masks(stepped, foreign))
 
     def left_out_errors(self, whole_days: bool = False) -> "LeftOutErrors":
         """Predict each measurement by all others, or by those of all other days.
@@ -426,7 +415,7 @@ class ConditionedModel:
 
 
 def _change_point_terms(
-    model: _LinearModel, changes: "_Changes", columns: Array
+    model: LinearModel, changes: "_Changes", columns: Array
 ) -> ChangePointScore:
     heliostats, most = model.readings.used.shape
     solution = changes.solve(model)
@@ -459,7 +448,7 @@ class _Solution:
     precision_y: Array
     evidence: Array
 
-    def precision(self, model: _LinearModel) -> Array:
+    def precision(self, model: LinearModel) -> Array:
         """Inverse covariance (H, N, N) of ``y`` given the changes."""
         if not self.cov.shape[-1]:
             return model.precision
@@ -519,7 +508,7 @@ class _Changes:
         variance[rows, self.place[rows, terms]] = _variances(noise)[self.kind[rows, terms]]
         return variance.cumsum(axis=1)
 
-    def solve(self, model: _LinearModel) -> _Solution:
+    def solve(self, model: LinearModel) -> _Solution:
         """Solve the linear model for the sizes of the changes."""
         heliostats, count = self.kind.shape
         after = np.arange(self.most) >= self.place[..., None]
@@ -550,7 +539,7 @@ class _Changes:
         precision_y = alpha - (weighted_design @ sizes[..., None])[..., 0]
         return _Solution(weighted_design, cov, sizes, precision_y, evidence)
 
-    def add_best(self, model: _LinearModel) -> Mask:
+    def add_best(self, model: LinearModel) -> Mask:
         """Add the change with the highest odds, if above one; mark the heliostats (H,) with one."""
         log_odds = self._log_odds(model, self.solve(model))
         best = log_odds.reshape(len(log_odds), -1).argmax(axis=1)
@@ -560,7 +549,7 @@ class _Changes:
         self.place = np.column_stack([self.place, np.where(is_likely, places, 0)])
         return is_likely
 
-    def _log_odds(self, model: _LinearModel, solution: _Solution) -> Array:
+    def _log_odds(self, model: LinearModel, solution: _Solution) -> Array:
         """Log odds (H, K, M) of a step before each measurement, or a foreign spot, by kind."""
         heliostats = len(self.kind)
         score = solution.precision_y.reshape(heliostats, self.most, 2)
@@ -590,7 +579,7 @@ class _Changes:
         )
         return np.where(used[:, None], log_odds, -np.inf)
 
-    def drop_unsupported(self, model: _LinearModel) -> None:
+    def drop_unsupported(self, model: LinearModel) -> None:
         """Drop changes with odds below one, the least likely of each heliostat first."""
         while self.kind.any():
             solution = self.solve(model)

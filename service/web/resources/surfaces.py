@@ -489,35 +489,6 @@ class TakeForm(Model):
     active: ReadVersion = None
 
 
-@pages.post("/heliostats/{name}/surfaces/{version}/take", dependencies=[OPERATE])
-def post_take_form(
-    name: NamePath,
-    version: VersionPath,
-    form: Annotated[TakeForm, Form()],
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-) -> Response:
-    """Make a version the active surface."""
-    choice = ChoiceIn(version=version, reason=form.reason or f"{identity.name} chose it")
-    put_current_surface(name, runtime, identity, choice, form.active)
-    return go_to(f"/heliostats/{name}#history-title")
-
-
-@pages.post("/heliostats/{name}/surfaces/{version}/keep", dependencies=[OPERATE])
-def post_keep_form(
-    name: NamePath,
-    version: VersionPath,
-    form: Annotated[TakeForm, Form()],
-    runtime: RuntimeDep,
-    identity: IdentityDep,
-) -> Response:
-    """Keep the active surface instead of a candidate."""
-    reason = form.reason or f"{identity.name} kept the active surface"
-    choice = ChoiceIn(version=version, reason=reason)
-    _decide(runtime, name, choice, identity.name, form.active, became_active=False)
-    return go_to(f"/heliostats/{name}#history-title")
-
-
 class DecisionUndoForm(Model):
     """The button that undoes a decision; without its number, the last one."""
 
@@ -549,6 +520,23 @@ def post_acknowledge_form(
     """Acknowledge that a surface is not trusted, as its alarm."""
     acknowledge_surface(name, version, runtime, identity, form)
     return go_to(f"/heliostats/{name}#warnings-title")
+
+
+@pages.post("/heliostats/{name}/surfaces/{version}/{verb}", dependencies=[OPERATE])
+def post_decision_form(
+    name: NamePath,
+    version: VersionPath,
+    verb: Literal["take", "keep"],
+    form: Annotated[TakeForm, Form()],
+    runtime: RuntimeDep,
+    identity: IdentityDep,
+) -> Response:
+    """Make a version the active surface, or keep the active one instead of it."""
+    is_taken = verb == "take"
+    said = f"{identity.name} {'chose it' if is_taken else 'kept the active surface'}"
+    choice = ChoiceIn(version=version, reason=form.reason or said)
+    _decide(runtime, name, choice, identity.name, form.active, became_active=is_taken)
+    return go_to(f"/heliostats/{name}#history-title")
 
 
 _SURFACE = (
