@@ -457,9 +457,14 @@ def right(client: TestClient, case: Case, fault: Fault) -> bool:
                 if one["name"] in ("sun_shape", "slope_error", "camera_blur")
             ]
         case "camera changed":
-            return not epochs.keys() - canted and any(
-                one["name"].startswith("camera_") for one in now_acting
-            )
+            begins = [
+                datetime.fromisoformat(f"{one['scope']['since']}T12:00:00+00:00")
+                for one in now_acting
+                if one["name"].startswith("camera_") and one.get("scope")
+            ]
+            first = first_of(case, fault, None)
+            is_dated = any(abs(begun - first) < timedelta(days=3) for begun in begins)
+            return not epochs.keys() - canted and is_dated
     raise ValueError(fault.kind)
 
 

@@ -15,7 +15,7 @@ from model.study.halves import find_drifts
 from model.study.outcome import MIN_RIVAL, Candidate, Found, Study
 from model.study.parameters import Term
 from model.study.scope_search import ScopeSearch
-from model.study.selection import ForwardSelection, exchange_begins, prune_redundant
+from model.study.selection import ForwardSelection, improve_begins, prune_redundant
 from model.study.trials import StudyOptions, Trial, TrialFitter
 
 MIN_IMAGES = 4
@@ -69,9 +69,9 @@ def study(
         if (has_motors or not term.kind.only_moves)
         and (has_neighbours or not term.kind.needs_neighbours)
     ]
-    for _ in range(options.most):
-        if found and not selection.can_improve(current):
-            break
+    left_to_find, is_retried = options.most, False
+    while left_to_find and (not found or selection.can_improve(current)):
+        left_to_find -= 1
         trials = {}
         for term in left:
             progress(term.kind.name)
@@ -91,11 +91,21 @@ def study(
             else choice.gain
         )
         found[dated] = Found(term.kind.name, choice.gain, shape, _names(term, choice.lookalikes))
-        current = prune_redundant(selection, fitter.forecast(trial) if dated != term else trial)
-        terms = current.parameters.terms
-        current = exchange_begins(selection, current)
-        renamed = dict(zip(terms, current.parameters.terms, strict=True))
-        found = {renamed[known]: one for known, one in found.items() if known in renamed}
+        added = fitter.forecast(trial) if dated != term else trial
+        current = improve_begins(selection, added)
+        earlier = current.parameters.terms[:-1]
+        renamed = dict(zip(added.parameters.terms, current.parameters.terms, strict=True))
+        if earlier != added.parameters.terms[:-1] and not is_retried:
+            # It made up for a wrong begin, too. Beside the right one another effect may be better.
+            current, is_retried, left_to_find = fitter.fit(earlier, current), True, left_to_find + 1
+            found = {renamed[known]: one for known, one in found.items() if known != dated}
+            continue
+        current = prune_redundant(selection, current)
+        found = {
+            renamed[known]: one
+            for known, one in found.items()
+            if renamed[known] in current.parameters.terms
+        }
         left = [
             other for other in left if other.kind is not term.kind or term.heliostats is not None
         ]

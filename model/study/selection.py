@@ -10,7 +10,7 @@ the mean is above a minimum.
 Of the worthwhile candidates that no held-out image distinguishes from the best, the simplest is
 added. If the best has values by day, a much simpler one that gains most of that goes before it:
 what it leaves may be another effect's. After each addition effects that are no longer worthwhile
-are pruned, and the begins of two effects are exchanged where that is better.
+are pruned, and begins are estimated again, or exchanged, where that is better.
 """
 
 from collections.abc import Iterator, Sequence
@@ -225,27 +225,31 @@ def prune_redundant(selection: ForwardSelection, current: Trial) -> Trial:
     return current
 
 
-def exchange_begins(selection: ForwardSelection, current: Trial) -> Trial:
-    """Exchange the begins of two effects where that is better; their order stays.
+def improve_begins(selection: ForwardSelection, current: Trial) -> Trial:
+    """Estimate the begins of effects beside each other, and exchange two, where that is better.
 
     If a camera is changed within a week of haze, what is found first begins with the week, and what
-    is found second begins with the camera.
+    is found second has part of the week or begins with the camera.
     """
     fitter, scopes = selection.fitter, selection.scopes
-    for terms in _begins_exchanged(current.parameters.terms, scopes):
+    for terms in _begins_to_try(current.parameters.terms, scopes):
         trial = fitter.fit(terms, current)
-        for place in np.flatnonzero([one not in current.parameters.terms for one in terms]):
-            without = fitter.fit([*terms[:place], *terms[place + 1 :]], trial)
-            terms[place], trial = scopes.refine_span(terms[place], trial, without)
-        trial = fitter.forecast(trial)
-        if is_distinct(selection.gain(trial, current)):
-            return trial
+        for place, term in enumerate(terms):
+            if scopes.is_shared_since(term):
+                without = fitter.fit([*terms[:place], *terms[place + 1 :]], trial)
+                terms[place], trial = scopes.refine_span(term, trial, without)
+        if terms != list(current.parameters.terms):
+            trial = fitter.forecast(fitter.fit(terms, trial))
+            if is_distinct(selection.gain(trial, current)):
+                return trial
     return current
 
 
-def _begins_exchanged(terms: Sequence[Term], scopes: ScopeSearch) -> Iterator[list[Term]]:
-    """The same effects with the begins of two of all heliostats exchanged."""
+def _begins_to_try(terms: Sequence[Term], scopes: ScopeSearch) -> Iterator[list[Term]]:
+    """Several effects as they are, then with the begins of two of all heliostats exchanged."""
     places = [place for place, one in enumerate(terms) if scopes.is_shared_since(one)]
+    if places and len(terms) > 1:
+        yield list(terms)
     for first, second in combinations(places, 2):
         pairs = (first, second), (second, first)
         changed = {place: replace(terms[place], since=terms[other].since) for place, other in pairs}

@@ -24,7 +24,7 @@ from model.study.judging import Gain, few_gain, find_end, split
 from model.study.parameters import ParameterVector, Term, copied
 from model.study.scope_search import ScopeSearch, most_promising
 from model.study.scopes import ScopeCandidate, Span, best_span, single_heliostat_scopes, time_scopes
-from model.study.selection import ForwardSelection, exchange_begins
+from model.study.selection import ForwardSelection, improve_begins
 from model.study.trials import TrialFitter
 from service.base.settings import FIGURE_SCALES
 from service.drawing.study_report import study_page
@@ -386,20 +386,31 @@ def test_a_dated_effect_may_gain_less_where_surfaces_are_estimates(is_estimated:
 
 
 @pytest.mark.full
-def test_a_camera_that_was_changed_within_haze_has_its_own_day():
-    """What is found first may begin with the haze, and the haze with the camera."""
-    changed, hazy = date(2024, 6, 13), Since(date(2024, 6, 7), until=date(2024, 6, 19))
-    effects = [CameraShoulder(0.8, scope=Since(changed)), SunShapeEffect(0.15, scope=hazy)]
+@pytest.mark.parametrize("changed", [date(2024, 6, 13), date(2024, 6, 19)], ids=["within", "after"])
+def test_a_camera_that_was_changed_within_or_after_haze_has_its_own_day(changed: date):
+    """What is found first may begin with the haze, and the haze with the camera or at once."""
+    week = Since(date(2024, 6, 7), until=date(2024, 6, 19))
+    effects = [CameraShoulder(0.8, scope=Since(changed)), SunShapeEffect(0.15, scope=week)]
     fitter = TrialFitter(photographs(effects), JUELICH_MODEL, StudyOptions())
     selection = ForwardSelection(fitter, ScopeSearch(fitter))
-    camera, haze = (
-        Term(CameraShoulder, since=changed),
-        Term(SunShapeEffect, since=hazy.since, until=hazy.until),
-    )
-    wrong = [replace(camera, since=hazy.since), replace(haze, since=changed)]
-    exchanged = exchange_begins(selection, fitter.fit(wrong))
-    assert exchanged.parameters.terms == (camera, haze)
-    assert exchange_begins(selection, exchanged) is exchanged
+    camera = Term(CameraShoulder, since=changed)
+    haze = Term(SunShapeEffect, since=week.since, until=week.until)
+    is_within = week.until is not None and changed < week.until
+    begun = changed if is_within else week.since
+    wrong = [replace(camera, since=week.since), replace(haze, since=begun)]
+    improved = improve_begins(selection, fitter.fit(wrong))
+    assert improved.parameters.terms == (camera, haze)
+    assert improve_begins(selection, improved) is improved
+
+
+@pytest.mark.full
+def test_what_is_found_beside_a_wrong_begin_is_chosen_again():
+    """The camera is first thought to have changed with the haze before it."""
+    week, since = Since(date(2024, 6, 7), until=date(2024, 6, 16)), Since(date(2024, 6, 16))
+    effects = [CameraShoulder(0.8, scope=since), SunShapeEffect(0.3, scope=week)]
+    found = found_in(effects, "camera_shoulder", "camera_blur", "sun_shape")
+    begins = {one.name: one.scope.since for one in found.effects if isinstance(one.scope, Since)}
+    assert begins == {"camera_shoulder": since.since, "sun_shape": week.since}
 
 
 @pytest.mark.full
