@@ -79,35 +79,25 @@ def _sort_key(row: SurfaceRow) -> tuple[datetime, int]:
     return row.valid_from or EPOCH, row.version
 
 
-def promote(
+def apply_decision(
     session: Session,
     heliostat: HeliostatRow,
     surface: SurfaceRow,
+    became_active: bool,
     actor: str,
     grounds: Justification,
 ) -> DecisionRow:
-    """Make a version active. Versions that would take precedence over it become candidates."""
+    """Make a version active, or keep the active one. Then it is a candidate until it is promoted.
+
+    Versions that would take precedence over a new active one become candidates.
+    """
     lock_heliostat(session, heliostat)
-    row = _record(session, heliostat, surface, True, actor, grounds)
-    place = _sort_key(surface)
-    for other in session.scalars(select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)):
-        if _sort_key(other) > place:
+    row = _record(session, heliostat, surface, became_active, actor, grounds)
+    of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
+    for other in session.scalars(of_heliostat) if became_active else ():
+        if _sort_key(other) > _sort_key(surface):
             other.is_candidate = True
-    surface.is_candidate = False
-    session.flush()
-    return row
-
-
-def reject(
-    session: Session,
-    heliostat: HeliostatRow,
-    surface: SurfaceRow,
-    actor: str,
-    grounds: Justification,
-) -> DecisionRow:
-    """Keep the active surface. This version remains a candidate until somebody promotes it."""
-    row = _record(session, heliostat, surface, False, actor, grounds)
-    surface.is_candidate = True
+    surface.is_candidate = not became_active
     session.flush()
     return row
 
@@ -136,8 +126,7 @@ def decide(
     surface = get_surface(session, heliostat, version)
     if not (became_active or surface.is_candidate):
         raise ConflictError(f"version {version} of {name} is no candidate; reload the page")
-    change = promote if became_active else reject
-    return change(session, heliostat, surface, actor, grounds)
+    return apply_decision(session, heliostat, surface, became_active, actor, grounds)
 
 
 def _require_active(session: Session, heliostat: HeliostatRow, shown: int | None) -> None:

@@ -341,8 +341,9 @@ def study_store(runtime: Runtime, request: StudyIn, report: Report = no_report) 
     options = StudyOptions()
     if request.candidates is not None:
         options = replace(options, candidates=tuple(request.candidates))
-    # Scopes are searched after the effects, halves and terms outside the catalogue at the end.
-    most = (len(options.candidates) + 1) * options.most + 2
+    # Scopes are searched after the effects, of which one may be chosen again; halves and terms
+    # outside the catalogue at the end.
+    most = (len(options.candidates) + 1) * (options.most + 1) + 2
     steps = NamedSteps(most, report, "fits, at most")
     options = replace(options, between=steps.alive)
 

@@ -297,14 +297,13 @@ def keep_surface(session: Session, predicted: Predicted, actor: str) -> StoredSu
         return StoredSurface(row)  # it replaced nothing, so there is no decision to record or undo
     row.is_candidate = True
     session.flush()
+    became_active, grounds = judgement.became_active, judgement.grounds
     if active != judgement.against:
         other = "the ideal mirror" if judgement.against is None else f"version {judgement.against}"
         reason = f"version {active} became active while this one was compared with {other}"
-        return StoredSurface(
-            row, decision=decisions.reject(session, heliostat, row, actor, Justification(reason))
-        )
-    decide = decisions.promote if judgement.became_active else decisions.reject
-    return StoredSurface(row, decision=decide(session, heliostat, row, actor, judgement.grounds))
+        became_active, grounds = False, Justification(reason)
+    decision = decisions.apply_decision(session, heliostat, row, became_active, actor, grounds)
+    return StoredSurface(row, decision=decision)
 
 
 def _carry_acknowledgement(row: SurfaceRow, last: SurfaceRow | None) -> None:

@@ -136,7 +136,7 @@ def test_promotion_of_its_surface_confirms_it(database: Database):
         # Photographs of the former epoch judge the former surface only.
         assert [epoch_of(session, row, one).since for one in surfaces] == [None, CHANGED]
         assert [epoch_of(session, row, one).until for one in surfaces] == [CHANGED, None]
-        decisions.promote(session, row, surfaces[0], "tester", Justification("not so"))
+        decisions.apply_decision(session, row, surfaces[0], True, "tester", Justification("not so"))
     found = epoch(database)
     assert found is not None
     assert not found.is_confirmed
@@ -159,7 +159,7 @@ def test_a_person_may_confirm_a_surface_of_too_few_photographs(
         made = NewSurface("refined", z, z, points, epoch_since=CHANGED, measurements=of_epoch)
         surface = store.add_surface(session, row, made).row
         said = Justification("forecasts 3 photographs better", 0.81, after, 3)
-        decisions.reject(session, row, surface, "tester", said)
+        decisions.apply_decision(session, row, surface, False, "tester", said)
         offer = _confirming(session, row, found)
     expected = {"version": 2, "reason": "version 2 forecasts 3 photographs better"}
     assert (offer and offer["body"]) == (expected if is_offered else None)
