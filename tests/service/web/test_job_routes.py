@@ -529,7 +529,7 @@ def test_jobs_show_phase_counts_and_estimate_while_the_model_computes(
     steps.shown.clear()
     studied = client.post("/v1/jobs/studies", json={"candidates": ["sun_shape", "soiling"]})
     assert finish(client, studied)["reason"] == "enough"
-    assert steps.shown == [("fits, at most", done, 11, done > 0) for done in range(3)]
+    assert steps.shown == [("fits, at most", done, 14, done > 0) for done in range(3)]
 
 
 @pytest.mark.parametrize("kind", ["predictions", "studies", "forecasts"])
