@@ -580,7 +580,8 @@ def _camera(session: Session) -> Iterator[Alarm]:
     if study is not None and model_versions.find_adopted(session, study.id) is None:
         for effect in study[1] or ():
             scope = effect.get("scope") or {}
-            if scope.get("kind") == "since" and is_of_images(effect["name"]):
+            is_acting = scope.get("kind") == "since" and not scope.get("until")
+            if is_acting and is_of_images(effect["name"]):
                 name, day = effect["name"], scope["since"]
                 yield Alarm(
                     "camera",
