@@ -177,7 +177,7 @@ def test_head_answers_as_get_without_its_body(filled: TestClient):
     asked = 0
     for method, template in all_routes():
         path = template.replace("{path:path}", "index.html").format(
-            name="AA39", measurement="1", number="1", version="1", view="thumbnail"
+            name="AA39", measurement="1", number="1", version="1", view="thumbnail", verb="take"
         )
         if method != "GET" or path in (
             "/",
