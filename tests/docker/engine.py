@@ -232,7 +232,16 @@ class Composition:
         with httpx.Client(
             base_url=f"http://127.0.0.1:{self.port}", headers=headers, timeout=WAIT_LIMIT_S
         ) as http:
+            # The engine may break connections from outside while another container comes or goes.
+            until(lambda: _answers(http), "the published port answers")
             yield Client(http)
+
+
+def _answers(http: httpx.Client) -> bool:
+    try:
+        return http.get("/livez").is_success
+    except httpx.TransportError:
+        return False
 
 
 class Client:
