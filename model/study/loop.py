@@ -98,14 +98,11 @@ def study(
         if earlier != added.parameters.terms[:-1] and not is_retried:
             # It made up for a wrong begin, too. Beside the right one another effect may be better.
             current, is_retried, left_to_find = fitter.fit(earlier, current), True, left_to_find + 1
-            found = {renamed[known]: one for known, one in found.items() if known != dated}
+            found = {new: found[old] for old, new in renamed.items() if old != dated}
             continue
         current = prune_redundant(selection, current)
-        found = {
-            renamed[known]: one
-            for known, one in found.items()
-            if renamed[known] in current.parameters.terms
-        }
+        kept = current.parameters.terms
+        found = {new: found[old] for old, new in renamed.items() if new in kept}
         left = [
             other for other in left if other.kind is not term.kind or term.heliostats is not None
         ]

@@ -87,16 +87,16 @@ def apply_decision(
     actor: str,
     grounds: Justification,
 ) -> DecisionRow:
-    """Make a version active, or keep the active one. Then it is a candidate until it is promoted.
+    """Make a version active, or a candidate until somebody promotes it.
 
     Versions that would take precedence over a new active one become candidates.
     """
     lock_heliostat(session, heliostat)
     row = _record(session, heliostat, surface, became_active, actor, grounds)
-    of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
-    for other in session.scalars(of_heliostat) if became_active else ():
-        if _sort_key(other) > _sort_key(surface):
-            other.is_candidate = True
+    if became_active:
+        of_heliostat = select(SurfaceRow).where(SurfaceRow.heliostat_id == heliostat.id)
+        for other in session.scalars(of_heliostat):
+            other.is_candidate = other.is_candidate or _sort_key(other) > _sort_key(surface)
     surface.is_candidate = not became_active
     session.flush()
     return row

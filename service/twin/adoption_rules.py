@@ -24,9 +24,12 @@ def why_refused(findings: StudyFindings) -> str | None:
         return next(_losses(findings.transfer or {}), None)
     if not findings.effects:
         return "it found no effect; there is nothing to adopt"
+    lacking = [name for name in names_of(findings) if name not in CATALOGUE]
+    if lacking:
+        return f"the file of its effect {lacking[0]} is not loaded (HELIOTWIN_EFFECTS_FROM)"
     if findings.verdict == "effect":
         return None
-    part = ", ".join(str(effect["name"]) for effect in findings.effects)
+    part = ", ".join(names_of(findings))
     return (
         f"{part} explains only part of the error and is not its cause, so it"
         " cannot be adopted; let a study try more effects"

@@ -159,11 +159,10 @@ def _of_day(session: Session, day: date, zone: str) -> _DayFigures:
     return _DayFigures(medians, light)
 
 
-def _cosine(photograph: Row[Any]) -> float:
-    """Cosine of incidence on the mirror, by its place, its target and the sun."""
-    position = photograph.east_m, photograph.north_m, photograph.up_m
-    to_target = np.subtract(photograph.geometry["center"], position)
-    sun = sun_direction(photograph.sun_azimuth_deg, photograph.sun_elevation_deg)
+def _cosine(row: Row[Any]) -> float:
+    """Cosine of incidence on a photograph's mirror, by its place, its target and the sun."""
+    to_target = np.subtract(row.geometry["center"], (row.east_m, row.north_m, row.up_m))
+    sun = sun_direction(row.sun_azimuth_deg, row.sun_elevation_deg)
     return float(np.sqrt((1 + sun @ to_target / np.linalg.norm(to_target)) / 2))
 
 

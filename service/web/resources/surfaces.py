@@ -482,13 +482,6 @@ def acknowledge_surface(
 # --------------------------------------------------------------------------------------------------
 
 
-class TakeForm(Model):
-    """The button, with an optional reason, and the version that was active; 0 for none."""
-
-    reason: Annotated[Text, Field(max_length=200)] = ""
-    active: ReadVersion = None
-
-
 class DecisionUndoForm(Model):
     """The button that undoes a decision; without its number, the last one."""
 
@@ -522,6 +515,14 @@ def post_acknowledge_form(
     return go_to(f"/heliostats/{name}#warnings-title")
 
 
+class TakeForm(Model):
+    """The button, with an optional reason, and the version that was active; 0 for none."""
+
+    reason: Annotated[Text, Field(max_length=200)] = ""
+    active: ReadVersion = None
+
+
+# After the form of an acknowledgement: this path would match its path, too.
 @pages.post("/heliostats/{name}/surfaces/{version}/{verb}", dependencies=[OPERATE])
 def post_decision_form(
     name: NamePath,

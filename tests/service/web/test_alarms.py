@@ -308,8 +308,9 @@ def test_camera_that_a_study_found_changed_until_that_is_adopted(app: FastAPI, c
     of_both = partial(study_row, heliostats=["AA39", "AB01"])
     with app.state.runtime.database.writing() as session:
         ended = {"name": "camera_ghost", "parameters": {}, "scope": since | {"until": "2024-06-09"}}
+        not_loaded = {"name": "focus_by_hour", "parameters": {}, "scope": since}
         number = store.add_study(
-            session, of_both(SLOPE | {"scope": since}, ended, blur | {"scope": since})
+            session, of_both(SLOPE | {"scope": since}, ended, not_loaded, blur | {"scope": since})
         ).id
         other = blur | {"parameters": {}, "scope": since | {"since": "2024-06-09"}}
         store.add_study(session, study_row(other))  # of one heliostat: nothing about the camera
