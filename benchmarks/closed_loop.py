@@ -198,7 +198,6 @@ def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
     """
     folder = read_folder(root, HELIOSTATS)
     for name, heliostat in folder.plant.heliostats.items():
-        images = read_observations(folder, name)
         measured = folder.measured_surface(name)
         assert measured is not None
         truth = measured_heights(heliostat, measured)
@@ -206,16 +205,18 @@ def real_surfaces(root: Path, effects: Sequence[Effect]) -> None:
         def by_deflectometry(*_: object, truth: np.ndarray = truth) -> np.ndarray:
             return truth
 
+        # The effects may be a curve of the camera. Then the images are taken as counts.
+        images = [read_observations(folder, name, model) for model in ((), effects)]
         for method, surface in {**METHODS, "measured": by_deflectometry}.items():
-            for label, model in (("without", []), ("with", list(effects))):
-                errors = surface_errors(surface(heliostat, images[:8], model), truth)
+            for label, model, own in zip(("without", "with"), ((), effects), images, strict=True):
+                errors = surface_errors(surface(heliostat, own[:8], model), truth)
                 fresh = (
-                    left_out_accuracy(heliostat, images, model, surface)
-                    if len(images) > 2
+                    left_out_accuracy(heliostat, own, model, surface)
+                    if len(own) > 2
                     else float("nan")
                 )
-                log_errors(f"{name}, {method}, {label} the effect", errors, len(images[:8]), fresh)
-                label = f"{name}, {len(images[:8])} photographs, {method} | {label}"
+                log_errors(f"{name}, {method}, {label} the effect", errors, len(own[:8]), fresh)
+                label = f"{name}, {len(own[:8])} photographs, {method} | {label}"
                 print(f"| {label} | {figures(errors)} | {fresh:.3f} |", flush=True)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from heliotwin.folder import observations_of
 from heliotwin.folder_store import open_folder
 from heliotwin.folder_study import photographs_of
+from model.effects import Effect
 from model.imaging import ImageKind
 from model.observation import Observation
 from model.pointing import Reading
@@ -16,9 +17,11 @@ from service.twin.measurements import AcceptedMeasurement, accepted_measurement
 from service.twin.photographs.readings import load_readings
 
 
-def read_observations(folder: MeasurementFolder, heliostat: str) -> list[Observation]:
-    """Observations of one heliostat."""
-    with open_folder(folder) as opened:
+def read_observations(
+    folder: MeasurementFolder, heliostat: str, effects: Sequence[Effect] = ()
+) -> list[Observation]:
+    """Observations of one heliostat, as verbs with ``--effects`` take its images."""
+    with open_folder(folder, effects=effects) as opened:
         return observations_of(opened, heliostat)[0]
 
 
