@@ -122,11 +122,9 @@ class Mount:
         return cls(_EAST, _UP, _UPRIGHT, pivot, offset, actuators, axis_zero=zero)
 
     @classmethod
-    def azimuth_elevation(
-        cls, joint: ArrayLike = (0.0, 0.0, 0.0), mirror_offset: ArrayLike = (0.0, 0.0, 0.0)
-    ) -> "Mount":
+    def azimuth_elevation(cls, mirror_offset: ArrayLike = (0.0, 0.0, 0.0)) -> "Mount":
         """First axis up, second the mirror's horizontal axis; upright and facing south at zero."""
-        return cls(_UP, _EAST, _UPRIGHT, _floats(joint), _floats(mirror_offset))
+        return cls(_UP, _EAST, _UPRIGHT, np.zeros(3), _floats(mirror_offset))
 
     @classmethod
     def stack(cls, mounts: Sequence["Mount"]) -> "Mount":

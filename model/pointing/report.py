@@ -130,7 +130,7 @@ def _prediction(mount: CalibratedMount) -> dict[str, Any]:
 
 def _prediction_from_json(document: Any) -> PredictedError | None:
     """Read a document of `_prediction`."""
-    if document is None or document["median"] is None:
+    if document["median"] is None:
         return None
     low, high = document["ci90"]
     return PredictedError(
@@ -168,7 +168,7 @@ def _format_error(where: str, error: Exception) -> InvalidInputError:
     return InvalidInputError(f"{where}: not a calibrated mount of `heliotwin calibrate`: {fault}")
 
 
-def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> CalibratedMount:
+def mount_from_json(document: Any, where: str) -> CalibratedMount:
     """Read a mount from a document of `mount_to_json`; `InvalidInputError` for any other."""
     try:
         history = document["history"]
@@ -182,9 +182,8 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
             for name in ("drift", "jitter", "stepped", "residuals")
         }
         foreign = np.isin(np.arange(count), history["foreign"])
-        # Documents of before November 2026 have no predictions.
-        predicted = np.array(history.get("predicted", [None] * count), dtype=np.float64)
-        prediction = _prediction_from_json(document.get("predicted_error_mrad"))
+        predicted = np.array(history["predicted"], dtype=np.float64).reshape(count)
+        prediction = _prediction_from_json(document["predicted_error_mrad"])
         entries = [document["parameters"][name] for name in NAMES]
         parameters, spread, prior = (
             np.array([e[key] for e in entries]) for key in ("value", "std", "prior_std")
@@ -212,8 +211,6 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         raise _format_error(where, error) from None
     if not finite:
         raise InvalidInputError(f"{where}: a calibrated mount must have finite numbers only")
-    if len(predicted) != count:
-        raise InvalidInputError(f"{where}: 'predicted' needs as many values as 'at'")
     return CalibratedMount(
         parameters=parameters,
         covariance=covariance,
@@ -225,7 +222,7 @@ def mount_from_json(document: Any, where: str, noise: Noise | None = None) -> Ca
         steps=steps,
         predicted=predicted,
         prediction=prediction,
-        noise=noise or Noise(),
+        noise=Noise(),
         **values,
     )
 

@@ -190,20 +190,13 @@ def has_warning(type_: str) -> ColumnElement[bool]:
     return cast(MeasurementRow.warnings, Text).contains(f'"{type_}"')
 
 
-def images_of_photograph(
-    session: Session, row: MeasurementRow, arrays: bool = False
-) -> dict[str, MeasurementRow]:
-    """All images of the photograph of ``row`` by kind, with their ``arrays`` on request."""
+def images_of_photograph(session: Session, row: MeasurementRow) -> dict[str, MeasurementRow]:
+    """All images of the photograph of ``row`` by kind."""
     if row.external_id is None:
         return {row.kind: row}
     query = select(MeasurementRow).where(
         MeasurementRow.heliostat_id == row.heliostat_id,
         MeasurementRow.external_id == row.external_id,
-    )
-    query = (
-        query.order_by(MeasurementRow.id).options(undefer(MeasurementRow.arrays))
-        if arrays
-        else query
     )
     return {one.kind: one for one in session.scalars(query)}
 

@@ -3,8 +3,8 @@
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Hashable
+from typing import Any, Generic, Protocol, TypeVar
 
 from cachetools import FIFOCache, LRUCache, TTLCache, cached
 from sqlalchemy.exc import SQLAlchemyError
@@ -69,13 +69,6 @@ Key = TypeVar("Key", bound=Hashable)
 logger = logging.getLogger("heliotwin.service")
 
 
-class CachedResults(NamedTuple, Generic[Key, Value]):
-    """Known results by key, and the number of missing ones."""
-
-    known: dict[Key, Value]
-    n_missing: int
-
-
 class BackgroundCache(Generic[Key, Value]):
     """Cache of results by key; one thread computes missing ones, each once.
 
@@ -96,29 +89,9 @@ class BackgroundCache(Generic[Key, Value]):
         self._changed = threading.Condition()
         self._known: FIFOCache[Key, Value] = FIFOCache(most)
         self._wanted: OrderedDict[Key, None] = OrderedDict()
-        self.awaited: list[Key] = []
         self._under_way: Key | None = None
         self._is_closed = False
         self._thread: threading.Thread | None = None
-
-    def get_many(self, keys: Iterable[Key], seconds: float = 0.0) -> CachedResults[Key, Value]:
-        """Known results of the keys after at most ``seconds``.
-
-        From now on only these keys, and those that a caller waits for, are computed.
-        """
-        with self._changed:
-            requested = list(dict.fromkeys(keys))
-            missing = [key for key in requested if key not in self._known]
-            # Keys that nobody requests any more are dropped. The current key is not computed twice.
-            queued = [*filter(self.awaited.__contains__, self._wanted), *missing]
-            self._wanted = OrderedDict.fromkeys(k for k in queued if k != self._under_way)
-            self._start()
-            if missing and seconds:
-                self._changed.wait_for(
-                    lambda: all(key in self._known for key in missing) or self._is_closed, seconds
-                )
-            known = {key: self._known[key] for key in requested if key in self._known}
-            return CachedResults(known, len(requested) - len(known))
 
     def wait_for(self, key: Key, seconds: float) -> Value | None:
         """The result of one key, computed next; None if not ready after ``seconds``."""
@@ -129,9 +102,7 @@ class BackgroundCache(Generic[Key, Value]):
                 while len(self._wanted) > self._most:
                     self._wanted.popitem()
                 self._start()
-            self.awaited.append(key)
             self._changed.wait_for(lambda: key in self._known or self._is_closed, seconds)
-            self.awaited.remove(key)
             return self._known.get(key)
 
     def close(self) -> None:

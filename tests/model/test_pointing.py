@@ -511,8 +511,9 @@ def test_documents_bring_the_mount_back(world):
     np.testing.assert_allclose(mount.predicted, back.predicted, atol=1e-8)
     assert back.prediction is not None
     assert back.prediction.high == pytest.approx(mount.prediction.high, abs=1e-6)
-    earlier = {key: value for key, value in document.items() if key != "predicted_error_mrad"}
-    assert mount_from_json(earlier, "here").prediction is None
+    incomplete = {key: value for key, value in document.items() if key != "predicted_error_mrad"}
+    with pytest.raises(InvalidInputError, match="'predicted_error_mrad' is missing"):
+        mount_from_json(incomplete, "here")
     with pytest.raises(InvalidInputError, match="here"):
         mount_from_json({**document, "covariance": [1]}, "here")
     with pytest.raises(InvalidInputError, match="finite"):

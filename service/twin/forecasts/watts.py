@@ -152,7 +152,7 @@ def loss_chain(watts: Mapping[str, Any]) -> list[LossStage]:
     incident = watts["incident_w"]
     stages, left = [LossStage("on the mirrors' area", None, None, incident, 1.0)], incident
     for name in LOSSES:
-        factor = watts.get(name, 1.0)  # forecasts of before November 2026 have no cleanliness
+        factor = watts[name]
         before, left = left, left * factor
         stages.append(LossStage(name, factor, before - left, left, left / incident))
     return stages

@@ -55,8 +55,10 @@ MOUNT = {
     "history": {
         "at": TIMES,
         **{name: [[0.0, 0.0], [0.0, 0.0]] for name in ("drift", "jitter", "stepped", "residuals")},
+        "predicted": [None, 1e-3],
         "foreign": [0],
     },
+    "predicted_error_mrad": {"median": 1.0, "ci90": [0.5, 2.0], "measurements": 9},
     "parameters": dict.fromkeys(NAMES, NUMBER),
     "covariance": np.eye(len(NAMES)).tolist(),
     "steps": [

@@ -1,7 +1,6 @@
 """Background computations: once for each key, however many requests arrive meanwhile."""
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -10,7 +9,7 @@ from fastapi.testclient import TestClient
 from service.twin.alarms import field_overview
 from service.twin.caches import BackgroundCache
 from tests.service.conftest import FakeOperations, Post, png, sun_at
-from tests.waiting import WAIT_LIMIT_S, until
+from tests.waiting import WAIT_LIMIT_S
 
 
 def test_what_is_under_way_is_neither_queued_again_nor_done_twice():
@@ -23,15 +22,14 @@ def test_what_is_under_way_is_neither_queued_again_nor_done_twice():
         return key.upper()
 
     cache: BackgroundCache[str, str] = BackgroundCache(work, "", "test", 10)
-    assert cache.get_many(["a", "b"]) == ({}, 2)
+    assert cache.wait_for("a", 0) is None
     assert began.wait(WAIT_LIMIT_S)
     # As a page asks that looks again before its first answer is there.
-    assert cache.get_many(["a", "b"]) == ({}, 2)
-    assert cache.wait_for("a", 0) is None
+    assert [cache.wait_for(key, 0) for key in ("a", "b", "c", "b")] == [None] * 4
     go.set()
-    assert (cache.wait_for("a", WAIT_LIMIT_S), cache.wait_for("b", WAIT_LIMIT_S)) == ("A", "B")
+    assert [cache.wait_for(key, WAIT_LIMIT_S) for key in "abc"] == ["A", "B", "C"]
     cache.close()
-    assert done == ["a", "b"]
+    assert done == ["a", "b", "c"]
 
 
 def test_what_fails_has_an_answer_too_and_the_rest_is_done():
@@ -40,35 +38,9 @@ def test_what_fails_has_an_answer_too_and_the_rest_is_done():
 
     cache: BackgroundCache[int, float] = BackgroundCache(work, -1.0, "test", 2)
     assert [cache.wait_for(key, WAIT_LIMIT_S) for key in (0, 1, 2)] == [-1.0, 1.0, 0.5]
-    assert cache.get_many([0, 1, 2])[0] == {1: 1.0, 2: 0.5}
+    assert [cache.wait_for(key, 0) for key in (1, 2)] == [1.0, 0.5]
     cache.close()
     assert cache.wait_for(4, WAIT_LIMIT_S) is None
-
-
-def test_a_key_that_a_caller_waits_for_is_computed_though_others_ask_for_other_keys():
-    began, go = threading.Event(), threading.Event()
-
-    def work(key: str) -> str:
-        began.set()
-        go.wait(WAIT_LIMIT_S)
-        return key.upper()
-
-    cache: BackgroundCache[str, str] = BackgroundCache(work, "", "test", 10)
-    assert cache.get_many(["a", "a"]) == ({}, 1)
-    assert began.wait(WAIT_LIMIT_S)
-    with ThreadPoolExecutor(1) as threads:
-        answer = threads.submit(cache.wait_for, "b", WAIT_LIMIT_S)
-        until(lambda: "b" in cache.awaited, "a caller waits")
-        assert cache.get_many(["c"]) == ({}, 1)
-        go.set()
-        assert answer.result() == "B"
-    cache.close()
-
-
-def test_who_waits_a_while_has_what_is_quick():
-    cache: BackgroundCache[int, int] = BackgroundCache(lambda key: 2 * key, 0, "test", 10)
-    assert cache.get_many([1, 2, 3], WAIT_LIMIT_S) == ({1: 2, 2: 4, 3: 6}, 0)
-    cache.close()
 
 
 def test_the_field_reads_one_version_of_each_heliostat(
