@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from heliotwin.cli.output import make_table
 from heliotwin.demo.described import Demonstrated, write_southern_plant
-from heliotwin.demo.field_store import ACTOR, seed_field
+from heliotwin.demo.field_store import ACTOR, run_job, seed_field
 from heliotwin.demo.plant import POSITIONS, write_plant
 from heliotwin.field import FieldReport, FieldRequest, trace_field
 from heliotwin.folder import observations_of, surface_errors, write_json
@@ -59,6 +59,7 @@ from service.twin.forecasts.heliostat_forecast import make_forecast
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.importing import import_folder
 from service.twin.measurements import choose_diverse
+from service.twin.model_versions import declares_camera
 from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
@@ -172,6 +173,7 @@ def run_demo(root: Path, out: Path, console: Console) -> Mapping[str, object]:
             imported = import_folder(
                 runtime, whole, lambda name: bars.update(task, description=name, advance=1)
             )
+            camera = _declare_camera(runtime)
             made, skipped = _predict_all(runtime, folder, bars)
             if not made:
                 reasons = list_reasons(skipped)
@@ -184,6 +186,7 @@ def run_demo(root: Path, out: Path, console: Console) -> Mapping[str, object]:
     report: dict[str, object] = {
         "data": str(root),
         "store": imported["counts"],
+        "camera": camera,
         "heliostats": [asdict(result) for result in results],
         "study": study,
         "field": field,
@@ -191,8 +194,24 @@ def run_demo(root: Path, out: Path, console: Console) -> Mapping[str, object]:
     }
     write_json(out / "report.json", report)
     (out / "report.html").write_text(_page(report, results), encoding="utf-8")
+    if camera is not None:
+        console.print(f"camera: {camera}", highlight=False)
     _print(console, results, study["conclusion"], out, store)
     return report
+
+
+def _declare_camera(runtime: Runtime) -> str | None:
+    """Declare images without background as sRGB counts if forecasts say so; return what they say.
+
+    An operator does the same when the service's alarm offers it.
+    """
+    with runtime.database.reading() as session:
+        if declares_camera(session):
+            return None
+    chosen = run_job(runtime, "camera-choices").result or {}
+    if chosen["answer"] == "srgb":
+        run_job(runtime, "measurements", camera="srgb", reason="forecasts fit them so")
+    return chosen.get("in_words")
 
 
 def _study(runtime: Runtime, bars: Progress) -> dict[str, str | None]:

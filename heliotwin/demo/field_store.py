@@ -78,8 +78,8 @@ def seed_field(
         )
         others = sorted(set(names) - faulty_heliostats())
         chosen = sorted(faulty_heliostats() | set(others[::_EVERY]))
-        _in_threads(lambda part: _run(runtime, "predictions", heliostats=part, images=8), chosen)
-        _run(runtime, "calibrations")
+        _in_threads(lambda part: run_job(runtime, "predictions", heliostats=part, images=8), chosen)
+        run_job(runtime, "calibrations")
         write_photographs(root, plant, newer, progress)
         folder = read_folder(root, sorted({one.mirror.name for one in newer}))
         sent = {str(one.number) for one in newer}
@@ -97,18 +97,18 @@ def _do_work(runtime: Runtime, now: datetime) -> None:
     """Predict some surfaces again, study the hazy days, and plan the day."""
     midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
     names = sorted(faulty_heliostats())
-    _run(runtime, "predictions", heliostats=names[:4])
+    run_job(runtime, "predictions", heliostats=names[:4])
     first, last = next(fault.days for fault in FAULTS if fault.kind == "hazy")
     days = {"since": midnight - timedelta(days=first), "until": midnight - timedelta(days=last)}
     candidates = ["sun_shape", "slope_error", "camera_blur"]
-    _run(runtime, "studies", heliostats=names, images=8, candidates=candidates, **days)
+    run_job(runtime, "studies", heliostats=names, images=8, candidates=candidates, **days)
     noon = midnight + timedelta(hours=12)
     receiver = {"target": "main", "dni_w_m2": "clear_sky"}
-    _run(runtime, "forecasts", sun={"at": noon}, resolution=(64, 64), **receiver)
+    run_job(runtime, "forecasts", sun={"at": noon}, resolution=(64, 64), **receiver)
     hours = {"first_at": noon - timedelta(hours=2), "last_at": noon + timedelta(hours=2)}
     plan = {"name": "all to the middle", "step_minutes": 120, "allowed_w_m2": _LIMIT_W_M2}
-    _run(runtime, "plans", resolution=(32, 32), **hours, **plan, **receiver)
-    _run(runtime, "aim-plans", sun={"at": noon}, limit_w_m2=_LIMIT_W_M2, **receiver)
+    run_job(runtime, "plans", resolution=(32, 32), **hours, **plan, **receiver)
+    run_job(runtime, "aim-plans", sun={"at": noon}, limit_w_m2=_LIMIT_W_M2, **receiver)
 
 
 def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> None:
@@ -118,7 +118,7 @@ def _in_threads(work: Callable[[list[str]], object], names: Sequence[str]) -> No
         list(pool.map(work, filter(None, parts)))
 
 
-def _run(runtime: Runtime, job: str, **payload: Any) -> None:
+def run_job(runtime: Runtime, job: str, **payload: Any) -> JobRow:
     """Queue a job, and work until it is done, also if an attempt fails and another one follows."""
     kind = KINDS[job]
     number = enqueue(runtime, kind, kind.payload.model_validate(payload), ACTOR).row.id
@@ -128,6 +128,7 @@ def _run(runtime: Runtime, job: str, **payload: Any) -> None:
             time.sleep(_POLL_S)
     if row.state != "done":
         raise RuntimeError(f"job {number} ({job}) {row.state}: {row.reason}")
+    return row
 
 
 def _read_job(runtime: Runtime, number: int) -> JobRow:

@@ -54,7 +54,7 @@ from service.twin.alarms.reasons import REASONS, HeliostatOrPlant, Reason, Reaso
 from service.twin.forecasts.aims import outdated_plans, plant_time_zone
 from service.twin.forecasts.mirror_states import MirrorStates
 from service.twin.pointing_errors import DriveStep, PointingState
-from service.twin.studies.cameras import FIGURES, CameraChange, CameraReadings
+from service.twin.studies.cameras import FIGURES, CameraChange, CameraReadings, find_camera_choice
 from service.twin.studies.field_change import AdoptableStudy, EffectFindings
 
 AlarmId = Annotated[
@@ -199,6 +199,7 @@ def compute_alarms(
         *_queue(session, settings),
         *_outdated_aims(session, settings, partial(measure_states, lines, cameras.light)),
         *_camera(session),
+        *_undeclared_camera(session),
         *_watch_cameras(session, cameras.changes, zone),
         *_clock(session),
         *_ended_effects(session, effects),
@@ -602,6 +603,25 @@ def _camera(session: Session) -> Iterator[Alarm]:
             "measure the stored photographs again (POST /v1/jobs/measurements), and predict"
             " surfaces again",
             f"version {declared.number}",
+        )
+
+
+def _undeclared_camera(session: Session) -> Iterator[Alarm]:
+    """Report images that are measured as light, and that forecasts fit better as sRGB counts."""
+    job = find_camera_choice(session)
+    if job is not None and job.result is not None and job.result["answer"] == "srgb":
+        better = (
+            f"accuracy of forecasts is {job.result['srgb']:.1%} as differences of sRGB counts, and"
+            f" {job.result['linear']:.1%} as light"
+        )
+        yield Alarm(
+            "camera_undeclared",
+            None,
+            job.created_at,
+            f"images without background are measured as light, but their {better}",
+            "declare their camera, see /plant",
+            "srgb",
+            offer=offers.declare_camera("srgb", better),
         )
 
 

@@ -248,9 +248,9 @@ def find_camera(
         return choose_camera(list(map(_photographed, known[:_MIRRORS])), model, operations.predict)
 
 
-def read_camera_choice(session: Session) -> dict[str, object] | None:
-    """The newest result of the job `camera-choices`; None if cameras are declared."""
-    query = select(JobRow.result).where(JobRow.kind == "camera-choices", JobRow.state == "done")
+def find_camera_choice(session: Session) -> JobRow | None:
+    """The newest finished job `camera-choices`; None if cameras are declared."""
+    query = select(JobRow).where(JobRow.kind == "camera-choices", JobRow.state == "done")
     newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
     return None if declares_camera(session) else newest
 

@@ -41,7 +41,7 @@ from service.twin import plant_setup
 from service.twin.forecasts.heliostat_forecast import receiver_as_json
 from service.twin.model_versions import CameraAnswer, get_model
 from service.twin.runtime import Runtime
-from service.twin.studies.cameras import read_camera_choice
+from service.twin.studies.cameras import find_camera_choice
 from service.web.auth.dependencies import (
     OPERATE,
     READ,
@@ -205,13 +205,14 @@ class TargetOut(PlaneOut, _Stored):
 def plant_out(session: Session) -> PlantOut:
     """The plant as JSON."""
     row, declared = store.get_plant(session), declared_of(session, find_current(session))
+    camera = find_camera_choice(session)
     return PlantOut(
         name=row.name,
         origin_wgs84=row.origin,
         declared=declared,
         sun_shape=describe_sun(get_model(session).optics.sun_shape),
         tower_size=None if row.tower is None else TowerSize(**row.tower),
-        camera_choice=read_camera_choice(session),
+        camera_choice=camera and camera.result,
     )
 
 
@@ -477,7 +478,7 @@ def plant_figures(runtime: Runtime) -> dict[str, object]:
             "types": _type_lines(plant),
             "model": model,
             "sun": None if model is None else describe_sun(model.optics.sun_shape),
-            "camera": None if plant is None else read_camera_choice(session),
+            "camera": find_camera_choice(session),
         }
 
 

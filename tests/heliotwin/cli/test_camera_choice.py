@@ -2,11 +2,14 @@
 
 import shutil
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from heliotwin.cli import demo
 from heliotwin.folder import flux_folder
 from heliotwin.folder_forecast import forecast_folder
 from heliotwin.folder_store import open_folder
@@ -14,6 +17,7 @@ from model.imaging.window import center_of_mass, flux_window
 from model.metrics import flux_accuracy
 from service.sources.folder import MeasurementFolder, read_folder
 from service.sources.photograph import CENTERED_SIZE_ERROR, CENTERED_WINDOW
+from tests.service.real import copy_measurements
 
 
 @pytest.fixture
@@ -41,6 +45,16 @@ def test_paints_images_are_taken_as_differences_of_counts(stj: Path, tmp_path: P
     assert len(by_mirror["AA31"]) == 8  # five of them are centred only
     means = [np.mean(values) for values in by_mirror.values()]
     assert np.mean(means) > 0.885
+
+
+@pytest.mark.full
+def test_the_demonstration_declares_the_camera_that_its_images_show(stj: Path, tmp_path: Path):
+    copy_measurements(stj, tmp_path / "real")
+    report = demo.run_demo(tmp_path / "real", tmp_path / "out", Console(quiet=True))
+    assert "differences of sRGB counts" in str(report["camera"])
+    assert "10 images without background" in (tmp_path / "out" / "report.html").read_text()
+    (aa39,) = (one for one in cast(Any, report["heliostats"]) if one["heliostat"] == "AA39")
+    assert aa39["accuracy_measured"] > 0.91  # as light 0.88
 
 
 @pytest.mark.full

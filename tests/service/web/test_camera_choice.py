@@ -33,7 +33,11 @@ def test_the_camera_is_chosen_shown_and_declared(real_client: TestClient):
     with runtime.database.reading() as session:
         rows = session.query(MeasurementRow).filter(MeasurementRow.kind == "flux")
         before = {row.id: unpack(row.arrays)["flux"] for row in rows}
-    result = run_job(client, "/v1/jobs/measurements", camera="srgb")
+    FieldStateWriter(runtime).update()
+    (alarm,) = client.get("/v1/alarms", params={"reason": "camera_undeclared"}).json()["items"]
+    assert "as differences of sRGB counts" in alarm["message"]
+    assert alarm["offer"]["path"] == "/v1/jobs/measurements"
+    result = run_job(client, alarm["offer"]["path"], **alarm["offer"]["body"])
     again = client.post("/v1/jobs/measurements", json={"camera": "linear"})
     assert (again.status_code, result["changed"]) == (409, len(before))
     while worker(client).work():
@@ -43,7 +47,7 @@ def test_the_camera_is_chosen_shown_and_declared(real_client: TestClient):
             assert unpack(row.arrays)["flux"].max() > before[row.id].max()
     FieldStateWriter(runtime).update()
     reasons = {one["reason"] for one in client.get("/v1/alarms").json()["items"]}
-    assert not reasons & {"camera", "fell", "accuracy"}
+    assert not reasons & {"camera", "camera_undeclared", "fell", "accuracy"}
     newest = max(client.get(path).json()["items"], key=lambda one: one["version"])
     assert newest["outdated"] == []
     assert newest["model_version"] != client.get(f"{path}/{network}").json()["model_version"]
