@@ -26,17 +26,21 @@ def choose(context: Context, _payload: CameraChoicesIn) -> Result:
     with context.runtime.database.reading() as session:
         if model_versions.declares_camera(session):
             raise ConflictError("the plant's model declares its cameras; they are not chosen")
+        version = model_versions.current_version(session)
         model, mirrors = model_versions.get_model(session), read_mirrors(session)
     context.report(0.0, phase="heliostats", n_done=0, n_total=len(mirrors))
     choice = find_camera(context.runtime, model, mirrors)
-    return Result({"answer": None} if choice is None else choice.to_json())
+    found = {"answer": None} if choice is None else choice.to_json()
+    return Result({**found, "model_version": version})
 
 
 def due(session: Session, _settings: Settings) -> str | None:
-    """The key of a due job: the first images, and again as often as their number has doubled."""
+    """The key of a due job: for each version of the model, and whenever images have doubled."""
     if model_versions.declares_camera(session) or (count := count_images(session)) < MIN_IMAGES:
         return None
-    return f"camera-choices-{(count // MIN_IMAGES).bit_length()}"
+    current = model_versions.find_current(session)
+    version = 0 if current is None else current.number
+    return f"camera-choices-{version}-{(count // MIN_IMAGES).bit_length()}"
 
 
 KIND = Kind(

@@ -44,7 +44,7 @@ from service.twin.measurements import (
     load_heliostat_context,
     to_observations,
 )
-from service.twin.model_versions import declares_camera
+from service.twin.model_versions import current_version, declares_camera
 from service.twin.runtime import Runtime
 
 FIGURES = {
@@ -249,10 +249,15 @@ def find_camera(
 
 
 def find_camera_choice(session: Session) -> JobRow | None:
-    """The newest finished job `camera-choices`; None if cameras are declared."""
+    """The newest finished job `camera-choices` of the current model, if it declares no camera.
+
+    An effect that was adopted since may explain the images, such as a curve of the camera.
+    """
     query = select(JobRow).where(JobRow.kind == "camera-choices", JobRow.state == "done")
     newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
-    return None if declares_camera(session) else newest
+    made_by = (newest.result or {}).get("model_version") if newest is not None else None
+    is_current = made_by == current_version(session) and not declares_camera(session)
+    return newest if is_current else None
 
 
 def _photographed(mirror: StoredMirror) -> PhotographedMirror:

@@ -1,11 +1,15 @@
 """The camera of a store's images: found once, shown to a person, and declared by a person."""
 
+from typing import Any, cast
+
 import pytest
 from fastapi.testclient import TestClient
 
+from model.effects import CATALOGUE
 from service.base.arrays import unpack
 from service.store.tables import MeasurementRow
 from service.twin.alarms.field_updates import FieldStateWriter
+from service.twin.model_versions import add_model
 from tests.service.real import run_job, runtime_of, worker
 from tests.service.web.pages import HTML
 
@@ -52,6 +56,26 @@ def test_the_camera_is_chosen_shown_and_declared(real_client: TestClient):
     assert newest["outdated"] == []
     assert newest["model_version"] != client.get(f"{path}/{network}").json()["model_version"]
     assert client.get("/v1/plant").json()["camera_choice"] is None
+
+
+@pytest.mark.full
+def test_a_curve_that_was_adopted_is_not_declared_again(real_client: TestClient):
+    """Both together would correct the counts twice."""
+    runtime = runtime_of(real_client)
+
+    def undeclared() -> list[Any]:
+        FieldStateWriter(runtime).update()
+        listed = real_client.get("/v1/alarms", params={"reason": "camera_undeclared"})
+        return cast(list[Any], listed.json()["items"])
+
+    run_job(real_client, "/v1/jobs/camera-choices")
+    assert len(undeclared()) == 1
+    with runtime.database.writing() as session:
+        add_model(session, [CATALOGUE["camera_shoulder"](compression=1.1)], {}, None, "tester")
+    assert undeclared() == []
+    assert real_client.get("/v1/plant").json()["camera_choice"] is None
+    assert run_job(real_client, "/v1/jobs/camera-choices")["answer"] != "srgb"
+    assert undeclared() == []
 
 
 @pytest.mark.full
