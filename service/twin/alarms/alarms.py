@@ -611,14 +611,14 @@ def _undeclared_camera(session: Session) -> Iterator[Alarm]:
     job = find_camera_choice(session)
     if job is not None and job.result is not None and job.result["answer"] == "srgb":
         better = (
-            f"accuracy of forecasts is {job.result['srgb']:.1%} as differences of sRGB counts, and"
+            f"accuracy {job.result['srgb']:.1%} as differences of sRGB counts,"
             f" {job.result['linear']:.1%} as light"
         )
         yield Alarm(
             "camera_undeclared",
             None,
             job.created_at,
-            f"images without background are measured as light, but their {better}",
+            f"images without background are measured as light, and fit as counts better: {better}",
             "declare their camera, see /plant",
             "srgb",
             offer=offers.declare_camera("srgb", better),
