@@ -50,6 +50,7 @@ from service.drawing.pictures import (
     surface_picture,
 )
 from service.drawing.templates import ASSETS, TEMPLATES
+from service.jobs.kinds import camera_choices
 from service.sources.folder import MeasuredSurface, MeasurementFolder, measured_heights, read_folder
 from service.sources.plant_file import read_plant
 from service.sources.plant_formats.imported import PLANT
@@ -59,7 +60,6 @@ from service.twin.forecasts.heliostat_forecast import make_forecast
 from service.twin.forecasts.requests import ForecastIn
 from service.twin.importing import import_folder
 from service.twin.measurements import choose_diverse
-from service.twin.model_versions import declares_camera
 from service.twin.runtime import Runtime
 from service.twin.studies.study import StudyIn, study_row, study_store
 from service.twin.surfaces.prediction import predict_surface
@@ -203,10 +203,10 @@ def run_demo(root: Path, out: Path, console: Console) -> Mapping[str, object]:
 def _declare_camera(runtime: Runtime) -> str | None:
     """Declare images without background as sRGB counts if forecasts say so; return what they say.
 
-    An operator does the same when the service's alarm offers it.
+    An operator does the same when the service's alarm offers it. None: there are too few images.
     """
     with runtime.database.reading() as session:
-        if declares_camera(session):
+        if camera_choices.due(session, runtime.settings) is None:
             return None
     chosen = run_job(runtime, "camera-choices").result or {}
     if chosen["answer"] == "srgb":
