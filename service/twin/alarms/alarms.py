@@ -621,7 +621,7 @@ def _undeclared_camera(session: Session) -> Iterator[Alarm]:
             f"images without background are measured as light, and fit as counts better: {better}",
             "declare their camera, see /plant",
             "srgb",
-            offer=offers.declare_camera("srgb", better),
+            offer=offers.declare_counts(better),
         )
 
 

@@ -57,14 +57,10 @@ def study(heliostats: Sequence[str] | None, since: datetime | None) -> Offer:
     return _post(label, "/v1/jobs/studies", heliostats=names, images=images, **change)
 
 
-def declare_camera(answer: str, reason: str) -> Offer:
-    """Declare what images without background are, and measure all photographs again."""
-    return _post(
-        "Declare their camera, and measure them again",
-        "/v1/jobs/measurements",
-        camera=answer,
-        reason=reason[:200],
-    )
+def declare_counts(reason: str) -> Offer:
+    """Declare images without background as sRGB counts, and measure all photographs again."""
+    label = "Declare their camera, and measure them again"
+    return _post(label, "/v1/jobs/measurements", camera="srgb", reason=reason[:200])
 
 
 def has_seen(studies: Iterable[Studied], until: datetime, heliostat: str | None = None) -> bool:

@@ -255,8 +255,9 @@ def find_camera_choice(session: Session) -> JobRow | None:
     """
     query = select(JobRow).where(JobRow.kind == "camera-choices", JobRow.state == "done")
     newest = session.scalar(query.order_by(JobRow.id.desc()).limit(1))
-    made_by = (newest.result or {}).get("model_version") if newest is not None else None
-    is_current = made_by == current_version(session) and not declares_camera(session)
+    if newest is None or newest.result is None or declares_camera(session):
+        return None
+    is_current = newest.result.get("model_version") == current_version(session)
     return newest if is_current else None
 
 
