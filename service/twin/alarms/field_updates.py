@@ -42,6 +42,9 @@ logger = logging.getLogger("heliotwin.jobs")
 # clock, and shortest time of computing results before they are written [s].
 _AGAIN_S = 30.0
 _BATCH_S = 1.0
+# Rest after an update, in times of how long it took: in a stream of photographs something is always
+# due, and requests share the processor.
+_REST = 3.0
 # Longest time between the time of a row and the commit that shows it.
 _COMMIT = timedelta(minutes=1)
 # Reasons that depend on results which may be pending.
@@ -83,19 +86,20 @@ class FieldStateWriter:
         self._marks, self._written_s = "", -_AGAIN_S
         self._levels: _Levels | None = None
         self._has_limit, self.is_large = False, False
+        self._rest_s = 0.0
 
     def run(self, stopping: threading.Event) -> None:
         """Write what changed until ``stopping``."""
         while not stopping.is_set():
-            has_more = False
+            self._rest_s = self._runtime.settings.job_poll_s
             try:
-                has_more = self.is_due() and self.update(stopping) > 0
+                if self.is_due():
+                    self.update(stopping)
             except SQLAlchemyError as error:
                 logger.warning("the state of the field waits for the database: %s", error)
             except Exception:  # other data may be free of the fault
                 logger.exception("the state of the field cannot be computed")
-            if not has_more:
-                stopping.wait(self._runtime.settings.job_poll_s)
+            stopping.wait(self._rest_s)
 
     def is_due(self) -> bool:
         """Whether something was stored since the last update, or that was long ago."""
@@ -120,8 +124,10 @@ class FieldStateWriter:
         )
         self.is_large, took_s = len(reading.lines) > LARGE, time.monotonic() - begun_s
         pending = [] if self._is_measuring() else reading.pending
-        self._compute(pending, max(_BATCH_S, 3 * took_s), stopping or threading.Event())
+        done = self._compute(pending, max(_BATCH_S, 3 * took_s), stopping or threading.Event())
         self._marks, self._written_s = "" if pending else reading.marks, time.monotonic()
+        worked_s = self._written_s - begun_s
+        self._rest_s = 0.0 if done < len(pending) else max(self._rest_s, _REST * worked_s)
         return len(pending)
 
     def _is_measuring(self) -> bool:
@@ -143,8 +149,11 @@ class FieldStateWriter:
 
     def _compute(
         self, pending: Sequence[HeliostatOverview], seconds: float, stopping: threading.Event
-    ) -> None:
-        """Compute and write results for some ``seconds``, in an order unlike other workers'."""
+    ) -> int:
+        """Compute and write results for some ``seconds``, in an order unlike other workers'.
+
+        Returns the number of heliostats.
+        """
         begun_s, found = time.monotonic(), dict[int, dict[str, object]]()
         for line in random.sample(pending, len(pending)):
             if stopping.is_set() or time.monotonic() - begun_s > seconds:
@@ -152,6 +161,7 @@ class FieldStateWriter:
             found[line.id] = compute_results(self._runtime, line)
         if found:
             self._runtime.database.run_in_transaction(lambda session: save_states(session, found))
+        return len(found)
 
 
 # --- what is written

@@ -1,7 +1,9 @@
 """Workers write the state of heliostats and the alarms, whether or not anybody reads."""
 
 import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -186,3 +188,33 @@ def test_worker_that_read_before_another_wrote_writes_nothing(
     with stale.database.reading() as session:
         assert acknowledgements.open_alarms(session) == []
         assert field_state.read_field_state(session).revision > 0
+
+
+class _OneRound(threading.Event):
+    """Ends with the first rest, and keeps its length [s]."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.rest_s = timeout or 0.0
+        self.set()
+        return True
+
+
+@pytest.mark.parametrize("computed", [0, 1])
+def test_worker_rests_after_all_is_computed(
+    stale: Runtime, monkeypatch: pytest.MonkeyPatch, computed: int
+):
+    """Photographs that come all the time do not keep the processor from requests."""
+    writer, stopping = FieldStateWriter(stale), _OneRound()
+    read = writer._read
+
+    def read_slowly() -> Any:
+        time.sleep(0.3)
+        reading = read()
+        return reading._replace(
+            lines=[replace(one, pending={"surface": 1}) for one in reading.lines]
+        )
+
+    monkeypatch.setattr(writer, "_read", read_slowly)
+    monkeypatch.setattr(writer, "_compute", lambda *_: computed)
+    writer.run(stopping)
+    assert stopping.rest_s >= 0.9 if computed else stopping.rest_s == 0
