@@ -4,7 +4,7 @@ The flux image that everything compares, predicts from and reports is a square a
 centre of mass, with the width, the pixels and the sum of Lewen et al. 2024 (iDLR).
 """
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,11 @@ def clipped_alike(forecast: Images, measured: Images, clipped: Images) -> Images
 
 
 def binned(images: Images, resolution: int) -> Images:
-    """Sum images (..., n R, n R) to R = ``resolution`` pixels along a side."""
-    size = images.shape[-1] // resolution
-    coarse: Images = images.reshape(*images.shape[:-2], resolution, size, resolution, size).sum(
-        (-3, -1)
-    )
+    """Sum images (..., n R, n R) to R = ``resolution`` pixels along a side.
+
+    Sums of every n-th line are several times faster than a sum over axes.
+    """
+    step = images.shape[-1] // resolution
+    rows: Any = sum(images[..., first::step, :] for first in range(step))
+    coarse: Images = sum(rows[..., first::step] for first in range(step))
     return coarse
