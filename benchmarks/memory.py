@@ -448,7 +448,7 @@ def inputs(root: Path) -> dict[str, Send]:
         ),
         "aims of 2,650 heliostats, 1024 x 1024": aims(2650, 1024),
         "aims of 2,650 heliostats, 128 x 128": aims(2650, 128),
-        "aims of 20,000 heliostats, 46 x 46": aims(20_000, 46),
+        "aims of 20,000 heliostats, 44 x 44": aims(20_000, 44),
         "aims of 41 heliostats, 1024 x 1024, twice": aims(41, 1024, times=2, steps=2),
         "import of an npz of 5.8 MB": imported(root, npz_bomb),
         "import of an h5 of declared 10^10 points": imported(root, h5_bomb),

@@ -17,11 +17,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from model.aiming.kernels import SIZE, Kernels
+from model.aiming.kernels import Kernels
 from model.aiming.plan import AimPlan, mirror_values
-
-_GRID = 2 * SIZE
-"""Places along each side of the grid of aims: twice the image, so that nothing wraps around."""
 
 _MIRRORS = 256
 """Mirrors whose aims are sought at once."""
@@ -98,58 +95,60 @@ def _best_aims(plan: AimPlan, multipliers: Tensor) -> _Best:
 
 def _best_of(kernels: Kernels, weights: Tensor) -> _Best:
     """Best aims of some mirrors for what light is worth in each pixel (P,) [m2]."""
-    pixel = kernels.sides / SIZE
-    worth = _on_planes(kernels, weights)
+    worth, size = _on_planes(kernels, weights), kernels.size
+    pixel, grid = kernels.sides / size, worth.shape[-1]
     images = torch.zeros_like(worth)
-    images[:, :SIZE, :SIZE] = kernels.expected
+    images[:, :size, :size] = kernels.expected
     spectrum = torch.fft.rfft2(worth) * torch.fft.rfft2(images).conj()
-    values = torch.fft.irfft2(spectrum, s=(_GRID, _GRID))
+    values = torch.fft.irfft2(spectrum, s=(grid, grid))
     flat = values.flatten(1).argmax(dim=1)
-    row, column = flat // _GRID, flat % _GRID
+    row, column = flat // grid, flat % grid
     best = values[torch.arange(len(flat)), row, column]
     best = best + _beyond(values, row, column)
     # Places of the image's first pixel; those of the second half are before the grid's beginning.
     down, right = (
-        torch.where(place > _GRID - SIZE // 2, place - _GRID, place) for place in (row, column)
+        torch.where(place > grid - size // 2, place - grid, place) for place in (row, column)
     )
-    middle = _GRID / 2 - SIZE / 2 + 0.5
+    middle = grid / 2 - size / 2 + 0.5
     moved = torch.stack([(right - middle) * pixel, (middle - down) * pixel], dim=-1)
     return _Best(moved, best)
 
 
 def _beyond(values: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """What the tops of parabolas through the best places are above them (N,)."""
-    here = torch.arange(len(values))
+    here, grid = torch.arange(len(values)), values.shape[-1]
     top = values[here, row, column]
     above = torch.zeros_like(top)
     for down, right in ((1, 0), (0, 1)):
-        before = values[here, (row - down) % _GRID, (column - right) % _GRID]
-        after = values[here, (row + down) % _GRID, (column + right) % _GRID]
+        before = values[here, (row - down) % grid, (column - right) % grid]
+        after = values[here, (row + down) % grid, (column + right) % grid]
         bend = (2 * top - before - after).clamp(min=1e-12)
         above = above + (after - before) ** 2 / (8 * bend)
     return above
 
 
 def _on_planes(kernels: Kernels, weights: Tensor) -> Tensor:
-    """What light is worth (N, _GRID, _GRID) on the pixels of the mirrors' planes.
+    """What light is worth (N, G, G) on the pixels of the mirrors' planes.
 
-    It is the adjoint of `Kernels.light`: bilinear shares of each place.
+    It is the adjoint of `Kernels.light`: bilinear shares of each place. The planes have twice the
+    images' pixels, so that nothing wraps around.
     """
+    grid = 2 * kernels.size
     worth = kernels.factors * weights[kernels.pixels]
     x, y = kernels.places.unbind(dim=1)
-    x, y = x * (SIZE / 2) + _GRID / 2, y * (SIZE / 2) + _GRID / 2
-    is_inside = (x >= 0) & (x < _GRID - 1) & (y >= 0) & (y < _GRID - 1)
+    x, y = x * (grid / 4) + grid / 2, y * (grid / 4) + grid / 2
+    is_inside = (x >= 0) & (x < grid - 1) & (y >= 0) & (y < grid - 1)
     worth = worth * is_inside
-    left, top = (place.floor().clamp(0, _GRID - 2) for place in (x, y))
+    left, top = (place.floor().clamp(0, grid - 2) for place in (x, y))
     right, down = x - left, y - top
-    index = (top * _GRID + left).long()
-    planes = torch.zeros(len(kernels), _GRID**2)
+    index = (top * grid + left).long()
+    planes = torch.zeros(len(kernels), grid**2)
     shares = (
         (0, (1 - right) * (1 - down)),
         (1, right * (1 - down)),
-        (_GRID, (1 - right) * down),
-        (_GRID + 1, right * down),
+        (grid, (1 - right) * down),
+        (grid + 1, right * down),
     )
     for offset, share in shares:
         planes.scatter_add_(1, index + offset, worth * share)
-    return planes.view(-1, _GRID, _GRID)
+    return planes.view(-1, grid, grid)

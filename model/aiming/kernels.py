@@ -34,15 +34,18 @@ from model.tracing.superposition import in_sight, passages
 Array = NDArray[np.float64]
 
 SIZE = 64
-"""Pixels along each side of a mirror's image."""
+"""Pixels along each side of a mirror's image in a field of up to `MANY` mirrors."""
+
+MANY = 12_000
+"""Mirrors above which images have half as many pixels along a side, for the memory."""
 
 # An image reaches to this share of the sun's light, and so many standard deviations of the errors.
 _CONE_SHARE, _DEVIATIONS = 0.98, 3.0
 
 _PADDING = 0.1
 
-MAX_PAIRS = 44_000_000
-"""Heliostats times pixels of a plan: each pair that has light takes 16 bytes."""
+MAX_PAIRS = 49_000_000
+"""Heliostats times pixels of a plan, each of 16 bytes; two images are as large as some pairs."""
 
 LARGE_PAIRS = 8_000_000
 """Pairs above which a machine should make one plan at a time."""
@@ -54,6 +57,11 @@ _PART = 2**20
 """Pairs of mirrors and pixels that are computed at once."""
 
 
+def image_size(heliostats: int) -> int:
+    """Pixels along each side of a mirror's image in a field of so many heliostats."""
+    return SIZE if heliostats <= MANY else SIZE // 2
+
+
 def require_few_pairs(heliostats: int, resolution: tuple[int, int]) -> None:
     """Refuse a map of (rows, columns) that has too many pixels for so many heliostats.
 
@@ -63,12 +71,11 @@ def require_few_pairs(heliostats: int, resolution: tuple[int, int]) -> None:
         If there are more than `MAX_PAIRS`; the message names the field and the remedy.
     """
     rows, columns = resolution
-    most = MAX_PAIRS // max(heliostats, 1)
+    most = max(MAX_PAIRS // max(heliostats, 1) - image_size(heliostats) ** 2 // 2, 0)
     if rows * columns > most:
         raise InvalidInputError(
-            f"resolution: {rows} x {columns} pixels for each of {heliostats} heliostats are"
-            f" {rows * columns * heliostats / 1e6:.0f} million; a plan of aims has at most"
-            f" {MAX_PAIRS / 1e6:.0f} million, here {most} pixels; give fewer rows and columns,"
+            f"resolution: {rows} x {columns} pixels for each of {heliostats} heliostats are more"
+            f" than the {most} that a plan of aims has of so many; give fewer rows and columns,"
             " and trace the field with the aims for a finer map"
         )
 
@@ -80,9 +87,9 @@ class MirrorImages:
     Attributes
     ----------
     names : tuple of N str
-    expected : Tensor (N, SIZE, SIZE) [W/m2]
+    expected : Tensor (N, S, S) [W/m2]
         Spread by the pointing errors, row 0 at the top.
-    sharp : Tensor (N, SIZE, SIZE) [W/m2]
+    sharp : Tensor (N, S, S) [W/m2]
         Without pointing errors.
     sides : Tensor (N,) [m]
         Of the images.
@@ -110,6 +117,11 @@ class MirrorImages:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def size(self) -> int:
+        """Pixels S along each side of the images."""
+        return self.expected.shape[-1]
 
     @classmethod
     def join(cls, parts: Iterable["MirrorImages"], most: int) -> "MirrorImages | None":
@@ -291,7 +303,7 @@ class ImageTile:
 
 
 class _Images(NamedTuple):
-    """Images (B, SIZE, SIZE) [W/m2] with and without pointing errors, and their sides [m]."""
+    """Images (B, S, S) [W/m2] with and without pointing errors, and their sides [m]."""
 
     expected: Tensor
     sharp: Tensor
@@ -306,9 +318,12 @@ class ImageTracer:
     ----------
     field : Superposition
         What is traced; its resolution does not matter.
+    size : int
+        See `image_size`.
     """
 
     field: Superposition
+    size: int = SIZE
 
     def __call__(self, tile: Tile) -> ImageTile:
         """Trace the mirrors of a tile, and skip those that cannot reach the receiver."""
@@ -338,7 +353,8 @@ class ImageTracer:
         )
         optics = optics_of(scene, optics)
         rays = central_rays(scene, self.field.samples)
-        images = _images(rays, torch.tensor(middles).to(scene.sun), scene, optics, max(planes.size))
+        places = torch.tensor(middles).to(scene.sun)
+        images = _images(rays, places, scene, optics, max(planes.size), self.size)
         aims = planes.centers + np.einsum("bi,bij->bj", middles, planes.axes[:, :2])
         single = torch.float32
         return MirrorImages(
@@ -365,9 +381,11 @@ def _through(points: Array, mirrors: Array, origins: Array, axes: Array) -> Arra
     return np.asarray(start[:, :2] - (start[:, 2] / way[:, 2])[:, None] * way[:, :2])
 
 
-def _images(rays: Rays, middles: Tensor, scene: Scene, optics: Optics, size: float) -> _Images:
-    """Images in windows about ``middles`` (B, 2) [m] that hold nearly all light which a receiver of
-    this ``size`` [m] can get.
+def _images(
+    rays: Rays, middles: Tensor, scene: Scene, optics: Optics, width: float, size: int
+) -> _Images:
+    """Images of ``size`` pixels a side, in windows about ``middles`` (B, 2) [m] that hold nearly
+    all light which a receiver of this ``width`` [m] can get.
     """
     errors = math.hypot(
         2 * float(torch.as_tensor(optics.slope_error).max()),
@@ -378,8 +396,8 @@ def _images(rays: Rays, middles: Tensor, scene: Scene, optics: Optics, size: flo
     blur = float((rays.slant_range * cone / -rays.direction[:, 2].clamp(max=-0.25)).max())
     mirror = float((rays.hits - middles[:, :, None]).abs().max())
     # Light further from an aim than the receiver's size is lost, wherever the aim is on it.
-    side = 2 * min(blur + mirror, size)
-    window = Window(side, side, SIZE, SIZE)
+    side = 2 * min(blur + mirror, width)
+    window = Window(side, side, size, size)
     irradiance = irradiance_of(scene, optics, rays.slant_range)
     expected, sharp = (
         grid.blurred(splat(grid.x, grid.y, grid.weight, *grid.shape)).clamp(min=0)

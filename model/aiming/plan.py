@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.aiming.kernels import SIZE, Kernels, Thinned
+from model.aiming.kernels import Kernels, Thinned
 from model.errors import InvalidInputError
 from model.progress import nothing_between
 
@@ -261,8 +261,7 @@ def _spread_out(kernels: Kernels) -> Tensor:
 
 def image_spread(kernels: Kernels) -> Tensor:
     """Standard deviations (N, 2) [m] of the images, right and up."""
-    images = kernels.expected
-    size = images.shape[-1]
+    images, size = kernels.expected, kernels.size
     place = (torch.arange(size) + 0.5) / size - 0.5
     total = images.sum(dim=(1, 2)).clamp(min=1e-30)
     spreads = []
@@ -289,7 +288,9 @@ class _Ascent:
         spread = image_spread(self.kernels)
         # Steps in units of the images' spread: far and near mirrors move alike. The image of a
         # mirror in full shadow has none.
-        self.unit = torch.maximum(spread.mean(dim=1), self.kernels.sides / SIZE)[:, None]
+        self.unit = torch.maximum(spread.mean(dim=1), self.kernels.sides / self.kernels.size)[
+            :, None
+        ]
         self.places = (plan.moved / self.unit).requires_grad_()
         self.multipliers = plan.multipliers.clone()
         self.step = step
@@ -383,8 +384,8 @@ class LinearDraws(NamedTuple):
 def linear_draws(plan: AimPlan, count: int = DRAWS) -> LinearDraws:
     """Draw the errors of `AimPlan.draws`, with flux that changes in proportion to them."""
     errors, pixels = _errors(plan.kernels, count, 0), torch.arange(len(plan.limit))
-    pairs = len(plan.kernels) * len(pixels)
-    bands = pixels.chunk(1 if pairs <= 2 * _DENSE else math.ceil(pairs / _DENSE))
+    size = max(len(plan.kernels), count // 2) * len(pixels)
+    bands = pixels.chunk(1 if size <= 2 * _DENSE else math.ceil(size / _DENSE))
     found = [_draws_on(plan, band, errors) for band in bands]
     sigma = torch.cat([one.sigma for one in found])
     return LinearDraws(sigma, np.max([one.ratios for one in found], axis=0))
@@ -397,13 +398,13 @@ def _draws_on(plan: AimPlan, band: Tensor, errors: Tensor) -> LinearDraws:
         plan = replace(plan, kernels=plan.kernels.on_pixels(band))
     drawn, variance = torch.zeros(len(errors), len(band)), torch.zeros(len(band))
     for axis in range(2):
-        drawn += errors[:, :, axis] @ _changes(plan, axis, variance)
+        drawn.addmm_(errors[:, :, axis], _changes(plan, axis, variance))
     ratios = drawn.add_(plan.flux).div_(limit).max(dim=1).values
     return LinearDraws(variance.sqrt(), ratios.double().numpy())
 
 
 _DENSE = 2**23
-"""Mirrors times pixels of a map whose changes are in memory at once."""
+"""Mirrors, or twice as many draws, times pixels of a map whose changes are in memory at once."""
 
 
 def _changes(plan: AimPlan, axis: int, variance: Tensor) -> Tensor:

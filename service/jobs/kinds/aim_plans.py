@@ -414,12 +414,12 @@ class _Planner:
             self._report(index, share, message)
 
         def trace() -> TracedImages:
-            kernels = trace_kernels(runtime, group, resolution, neighbours, report)
             middle = replace(self.fleet, aims={}).under(self.suns.steps[index][1], group.ideal)
             single = forecast_group(
-                runtime, middle, resolution, neighbours, _unreported(self.context)
+                runtime, middle, resolution, neighbours, lambda *_, **__: self.context.check()
             )
-            return_memory()
+            return_memory()  # before the images, which need most of it
+            kernels = trace_kernels(runtime, group, resolution, neighbours, report)
             require_some(single.heliostats, single.skipped)
             without, sources = frozenset(group.without_surface), group.sources(group.skipped)
             return TracedImages(kernels, single, group.skipped, without, sources)
@@ -463,7 +463,8 @@ class _Planner:
     def aims_of(self, index: int) -> dict[str, object]:
         """Aims and drives of a step, as in the result."""
         at, sun = self.suns.steps[index]
-        step, direction = StepAims.of(self._kept(index)), _direction(sun)
+        step = StepAims.of(self._kept(index))
+        direction = sun_direction(sun.azimuth_deg, sun.elevation_deg)
         active = dict(zip(step.names.tolist(), step.active.tolist(), strict=True))
         aims = step.aims()
         drives = {
@@ -484,15 +485,6 @@ class _Planner:
             kept = self._kept(index)
             maps = {name: np.maximum(one, kept[name]) for name, one in maps.items()}
         return maps
-
-
-def _unreported(context: Context) -> Any:
-    """Progress of a part that is too short to be counted."""
-    return lambda *_, **__: context.check()
-
-
-def _direction(sun: Sun) -> NDArray[np.float64]:
-    return sun_direction(sun.azimuth_deg, sun.elevation_deg)
 
 
 def _aim_arrays(plan: AimPlan, receiver: Receiver) -> dict[str, NDArray[Any]]:
