@@ -205,7 +205,8 @@ class Linearization:
     @cached_property
     def scores(self) -> Array:
         """g_i (M, K) of each image."""
-        return np.asarray(np.einsum("kmn,mn->mk", self.jacobian, self.residual, optimize=True))
+        of_images = zip(self.jacobian.swapaxes(0, 1), self.residual, strict=True)
+        return np.array([of_image @ residual for of_image, residual in of_images])
 
     def information_shares(self) -> Array:
         """Share (M,) of each image in tr(C F_i), the number of determined coefficients."""
@@ -234,10 +235,8 @@ class Linearization:
         Errors that look like a bent mirror make it larger than one (quasi-likelihood, Wedderburn
         1974, doi:10.1093/biomet/61.3.439).
         """
-        determined = self.covariance @ self.information
-        expected = np.trace(determined, axis1=1, axis2=2).sum() - np.einsum(
-            "mij,mji->", determined, determined
-        )
+        determined = (self.covariance @ of_image for of_image in self.information)
+        expected = sum(float(np.trace(one) - (one * one.T).sum()) for one in determined)
         return float(
             np.einsum("mi,ij,mj->", self.scores, self.covariance, self.scores) / max(expected, 1.0)
         )
@@ -261,8 +260,10 @@ class Linearization:
 
         The surface without image i differs by ``(I - C F_i)^-1 C g_i``.
         """
-        others = np.eye(len(self.covariance)) - self.information @ self.covariance
-        change = np.linalg.solve(others, self.scores[..., None])[..., 0] @ self.covariance
+        one = np.eye(len(self.covariance))
+        others = (one - of_image @ self.covariance for of_image in self.information)
+        solved = map(np.linalg.solve, others, self.scores)
+        change = np.array(list(solved)) @ self.covariance
         return np.asarray(
             self.residual + np.einsum("mk,kmn->mn", change, self.jacobian, optimize=True)
         )
@@ -295,7 +296,7 @@ class Linearization:
 def linearize(model: ImageModel, mode: Mode) -> Linearization:
     """The Gaussian approximation of the posterior at a mode."""
     whitener = mode.whitener(model)
-    white = whitener(np.concatenate([mode.jacobian, model.ripples]))
+    white = np.concatenate([whitener(mode.jacobian), whitener(model.ripples)])
     return Linearization(
         mode.hyper, white, whitener(model.measured - mode.state.images), whitener.bands
     )

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 BANDS = (3.0, 6.0, 10.0, 16.0, 24.0)
 """Upper ends of the bands of spatial frequency [half cycles per window]."""
 
+# Derivatives that are whitened at once: their cosine transforms are several times as large.
+_AT_ONCE = 16
+
 
 class Whitener:
     """Whitens changes of M images whose noise has a standard deviation ``sigma`` in each band.
@@ -85,6 +88,9 @@ class Whitener:
 
     def __call__(self, changes: NDArray[Any]) -> NDArray[Any]:
         """Whiten changes (..., M, R, R) to independent ones (..., M, n) of unit variance."""
+        if changes.ndim > 3 and len(changes) > _AT_ONCE:
+            parts = (changes[i : i + _AT_ONCE] for i in range(0, len(changes), _AT_ONCE))
+            return np.concatenate([self(part) for part in parts])
         white = self._divide_by_noise(changes)
         directions, shrinkage = (
             values.astype(changes.dtype) for values in (self._directions, self._shrinkage)
