@@ -219,6 +219,24 @@ def test_a_quarter_of_the_pixels_has_the_same_light(plant: Path):
     assert float(some @ thin.kernels.areas) == pytest.approx(power, rel=0.01)
 
 
+def test_images_of_half_as_many_pixels_have_the_same_light(
+    plant: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Those of more than `MANY` heliostats; sharpened by what interpolation blurs."""
+    request = FieldRequest("board", 180.0, 55.0, 900.0, resolution=(32, 32))
+    maps, bounds = [], []
+    for many in (kernels.MANY, 0):
+        monkeypatch.setattr(kernels, "MANY", many)
+        found = trace_kernels(read_plant(plant), request, no_progress).kernels
+        assert found.size == (64 if many else 32)
+        plan = single_aim(found, torch.full_like(found.areas, 30e3))
+        maps.append(plan.flux)
+        bounds.append(bound_power(plan, 1))
+    assert float((maps[1] - maps[0]).abs().sum()) < 0.02 * float(maps[0].sum())
+    assert float(maps[1].max()) == pytest.approx(float(maps[0].max()), rel=0.03)
+    assert bounds[1] == pytest.approx(bounds[0], rel=0.01)
+
+
 def test_parts_of_the_kernels_do_not_change_a_plan(plant: Path, monkeypatch: pytest.MonkeyPatch):
     """Light, draws and values are those of all pairs at once, and a pair takes 16 bytes."""
     request = FieldRequest("main", 180.0, 55.0, 900.0, resolution=(16, 40))
