@@ -260,10 +260,9 @@ class Linearization:
 
         The surface without image i differs by ``(I - C F_i)^-1 C g_i``.
         """
-        one = np.eye(len(self.covariance))
-        others = (one - of_image @ self.covariance for of_image in self.information)
-        solved = map(np.linalg.solve, others, self.scores)
-        change = np.array(list(solved)) @ self.covariance
+        identity = np.eye(len(self.covariance))
+        others = (identity - of_image @ self.covariance for of_image in self.information)
+        change = np.array([*map(np.linalg.solve, others, self.scores)]) @ self.covariance
         return np.asarray(
             self.residual + np.einsum("mk,kmn->mn", change, self.jacobian, optimize=True)
         )
