@@ -126,15 +126,13 @@ def provenance(record: dict[str, Any]) -> str:
     """How a record was measured."""
     if "source" in record:
         return f"Source: {record['source']}."
-    origin = "transcribed from the run of " if "transcribed" in record else ""
-    return f"`{record['command']}`: {origin}{place(record)}."
+    return f"`{record['command']}`: {place(record)}."
 
 
 def place(record: dict[str, Any]) -> str:
     """Date, commit and machine of a run."""
     made = record["machine"]
-    parts = [record["date"]]
-    parts += [f"commit {record['commit']}"] if record.get("commit") else []
+    parts = [record["date"], f"commit {record['commit']}"]
     parts += [f"{made['cores']} cores", made["processor"]]
     parts += [f"load {made['load']}"] if "load" in made else []
     return ", ".join(parts)
@@ -270,11 +268,10 @@ def key_table(prefix: str = "") -> str:
         )
     figures = markdown([*KEY_HEAD, "date", "run"], rows)
     origins = [
-        [str(number), f"`{one['command']}`", place(one), "yes" * ("transcribed" in one)]
+        [str(number), f"`{one['command']}`", place(one)]
         for number, one in enumerate(map(read, runs), 1)
     ]
-    head = ["run", "command", "date, commit and machine", "transcribed"]
-    return f"{figures}\n\n{markdown(head, origins)}"
+    return f"{figures}\n\n{markdown(['run', 'command', 'date, commit and machine'], origins)}"
 
 
 def readme_table() -> str:
