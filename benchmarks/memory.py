@@ -49,9 +49,8 @@ SIDE = int(PIXELS**0.5)
 TARGET = "multi_focus_tower"
 SUN = {"azimuth_deg": 200.0, "elevation_deg": 45.0}
 MEASUREMENT = {"target": TARGET, "sun": SUN}
-JOB_LIMIT_S = 900.0
-ENDLESS_S = 300.0
-"""The same for a job that nobody would wait for: all its tiles take the same memory."""
+JOB_LIMIT_S, ENDLESS_S = 900.0, 300.0
+"""Seconds after which a job is cancelled, and one whose parts all take the same memory."""
 
 
 class MemoryWatch:

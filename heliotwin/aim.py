@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from heliotwin.field import FieldRequest, light_field, no_light, trace_field
-from model.aiming.kernels import ImageTracer, Kernels, image_size, require_few_pairs
+from model.aiming.kernels import ImageTracer, Kernels, require_few_pairs
 from model.aiming.plan import AimPlan, plan_aims
 from model.aiming.uncertainty import plan_uncertainty
 from model.fleet import Superposition, tiles
@@ -169,8 +169,7 @@ def trace_kernels(
     setups = sorted(lit.setups, key=lambda one: math.dist(one.heliostat.position, goal))
     if rng is not None and request.surfaces is not None:
         setups = [_drawn(setup, request.surfaces, rng) for setup in setups]
-    tracer = ImageTracer(lit.task, image_size(len(setups)))
-    images = map(tracer, tiles(setups, lit.neighbours))
+    images = map(ImageTracer(lit.task, len(setups)), tiles(setups, lit.neighbours))
     kernels = join_images(
         lit.task, images, group, lambda count: step(f"images of {count} heliostats")
     )

@@ -1,6 +1,6 @@
 """A measurement folder as a temporary store, so that verbs compute as the service does."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -205,12 +205,7 @@ def open_folder(
                     model = model_versions.get_model(session)
                 camera = find_camera(runtime, model, mirrors.values())
                 if camera is not None and camera.answer == "srgb":
-                    owners = [mirror.twin.row.id for mirror in mirrors.values()]
-                    of_mirrors = MeasurementRow.heliostat_id.in_(owners)
-                    with runtime.database.writing() as session:
-                        plant = session.get_one(PlantRow, 1)
-                        plant.declared = (plant.declared or {}) | DECLARATIONS["srgb"]
-                        session.execute(delete(MeasurementRow).where(of_mirrors))
+                    _declare_counts(runtime, mirrors)
                     for name in mirrors:
                         refused |= _store_measurements(runtime, folder, name, kinds, no_progress)
             with runtime.database.reading() as session:
@@ -229,6 +224,15 @@ def _mirrors(opened: FolderStore) -> dict[str, StoredMirror]:
             z = None if surface is None else measured_heights(twin.heliostat, surface)
             mirrors[name] = StoredMirror(twin, rows, z)
     return mirrors
+
+
+def _declare_counts(runtime: Runtime, mirrors: Mapping[str, StoredMirror]) -> None:
+    """Declare differences of sRGB counts, and delete the measurements of ``mirrors``."""
+    owners = [mirror.twin.row.id for mirror in mirrors.values()]
+    with runtime.database.writing() as session:
+        plant = session.get_one(PlantRow, 1)
+        plant.declared = (plant.declared or {}) | DECLARATIONS["srgb"]
+        session.execute(delete(MeasurementRow).where(MeasurementRow.heliostat_id.in_(owners)))
 
 
 def read_mounts(path: Path, effects: Sequence[Effect]) -> dict[str, Any]:

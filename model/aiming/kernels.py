@@ -318,12 +318,12 @@ class ImageTracer:
     ----------
     field : Superposition
         What is traced; its resolution does not matter.
-    size : int
-        See `image_size`.
+    mirrors : int
+        Of the whole field, by which `image_size` goes.
     """
 
     field: Superposition
-    size: int = SIZE
+    mirrors: int
 
     def __call__(self, tile: Tile) -> ImageTile:
         """Trace the mirrors of a tile, and skip those that cannot reach the receiver."""
@@ -353,8 +353,8 @@ class ImageTracer:
         )
         optics = optics_of(scene, optics)
         rays = central_rays(scene, self.field.samples)
-        places = torch.tensor(middles).to(scene.sun)
-        images = _images(rays, places, scene, optics, max(planes.size), self.size)
+        places, size = torch.tensor(middles).to(scene.sun), image_size(self.mirrors)
+        images = _images(rays, places, scene, optics, max(planes.size), size)
         aims = planes.centers + np.einsum("bi,bij->bj", middles, planes.axes[:, :2])
         single = torch.float32
         return MirrorImages(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from model.aiming.kernels import ImageTile, ImageTracer, Kernels, MirrorImages, image_size
+from model.aiming.kernels import ImageTile, ImageTracer, Kernels, MirrorImages
 from model.errors import ModelError
 from model.fleet import (
     TILE,
@@ -245,8 +245,8 @@ def trace_kernels(
         traced(n_done)
 
     tiles = _tiles(runtime, fleet, field, TILE, 0)
-    tracer = ImageTracer(task, image_size(len(fleet.names)))
-    kernels = join_images(task, engine.map(tracer, tiles), fleet, tile_done)
+    images = engine.map(ImageTracer(task, len(fleet.names)), tiles)
+    kernels = join_images(task, images, fleet, tile_done)
     if kernels is None:
         name, reason = next(iter(fleet.skipped.items()), ("the store", "it holds no heliostat"))
         raise ConflictError(f"no heliostat reaches {fleet.receiver.name}; {name}: {reason}")

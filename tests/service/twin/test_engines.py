@@ -68,7 +68,7 @@ def test_threads_give_the_same_light_whatever_their_number(count: int):
 
 @pytest.mark.full
 def test_cluster_traces_the_same_images_of_mirrors(cluster: Any):
-    task = ImageTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)))
+    task = ImageTracer(Superposition(target(10.0), JUELICH_MODEL, (32, 32)), 1)
     images, expected = (
         MirrorImages.join(
             (one for tile in engine.map(task, some_tiles()) for one in tile.images), 32
