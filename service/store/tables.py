@@ -183,7 +183,8 @@ class MeasurementRow(Base):
     - ``sent_by`` is the name of the sender's key, or of the user who imported it.
     - ``forced`` is why it is stored although another heliostat has the same image.
     - ``forecast_accuracy`` [1] is that of the surface of its day, computed when the photograph
-      arrived. That surface had not used the photograph.
+      arrived. That surface had not used the photograph. ``forecast_key`` is what else it was based
+      on (`service.twin.surfaces.accuracy`).
     """
 
     __tablename__ = "measurements"
@@ -231,6 +232,7 @@ class MeasurementRow(Base):
     sent_by: Mapped[str | None] = mapped_column(Text)
     corrected_at: Mapped[datetime | None]
     forecast_accuracy: Mapped[float | None]
+    forecast_key: Mapped[str | None] = mapped_column(String(200))
     forced: Mapped[str | None] = mapped_column(Text)
 
     target: Mapped[TargetRow] = relationship(lazy="joined", innerjoin=True)

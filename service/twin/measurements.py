@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from service.base.errors import ConflictError
 from service.sources.photograph import CENTERED_SIZE_ERROR
 from service.store import mounts
 from service.store.surface_versions import NewSurface
-from service.store.tables import HeliostatRow, MeasurementRow, SurfaceRow
+from service.store.tables import HeliostatRow, MeasurementRow, MountRow, SurfaceRow
 from service.twin import model_versions
 from service.twin.model_versions import ModelVersion
 from service.twin.stored_mount import as_calibrated
@@ -220,11 +220,22 @@ def choose_diverse(
 
 @dataclass(frozen=True, eq=False)
 class HeliostatContext:
-    """A stored heliostat with the plant's model: inputs of tracing without surface and sun."""
+    """A stored heliostat with the plant's model: inputs of tracing without surface and sun.
+
+    ``mount`` is the row id of its newest mount; None if there is none.
+    """
 
     row: HeliostatRow
     heliostat: Heliostat
     model: ModelVersion
+    mount: int | None
+
+    @classmethod
+    def of(cls, row: HeliostatRow, mount: MountRow | None, model: ModelVersion) -> Self:
+        """The heliostat on a stored mount if that is valid, else as in its properties."""
+        return cls(
+            row, as_calibrated(row, mount, model), model, None if mount is None else mount.id
+        )
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -248,9 +259,7 @@ def load_heliostat_context(
     """
     row = store.get_heliostat(session, name)
     model = model_versions.get_model(session, model_version)
-    return HeliostatContext(
-        row, as_calibrated(row, mounts.find_mount_at(session, row), model), model
-    )
+    return HeliostatContext.of(row, mounts.find_mount_at(session, row), model)
 
 
 def heights_of(surface: SurfaceRow | NewSurface | None) -> Array | None:

@@ -126,8 +126,9 @@ class HeliostatOverview:
 
     A ``rank`` without an accuracy means that no photograph can evaluate the surface, because it was
     computed from all of them. ``candidate`` is the newest version of a heliostat without an active
-    surface. ``range_m`` is the distance to the nearest receiver's centre [m]. ``id`` is the row id.
-    ``pending`` are the results that no worker has computed yet, with what they will be based on.
+    surface. ``range_m`` is the distance to the nearest receiver's centre [m]. ``id`` is the row id,
+    ``updated_at`` when its properties changed. ``pending`` are the results that no worker has
+    computed yet, with what they will be based on.
     """
 
     name: str
@@ -146,6 +147,7 @@ class HeliostatOverview:
     fall: AccuracyFall | None = None
     candidate: ActiveSurface | None = None
     id: int = 0
+    updated_at: datetime | None = None
     pending: Mapping[str, int | str] = field(default_factory=dict)
 
     @property
@@ -164,7 +166,8 @@ class HeliostatOverview:
             return None
         calibrated_at = None if self.mounted is None else self.mounted.calibrated_at
         surface = 0 if self.surface is None else self.surface.id
-        return result_key(surface, self.corrected, model, calibrated_at, self.newest)
+        parts = (surface, self.corrected, model, calibrated_at, self.updated_at)
+        return result_key(*parts, self.newest)
 
 
 def _current_surfaces(
@@ -263,28 +266,32 @@ def read_summaries(session: Session, heliostat: int | None = None) -> list[Helio
     receivers = [store.stored_receiver(row).center for row in store.list_receivers(session)]
     states = _states(session, heliostat)
     row, none = HeliostatRow, _PhotographCounts()
-    query = select(row.id, row.name, row.photographs_changed_at, row.east_m, row.north_m, row.up_m)
+    dates, place = (row.photographs_changed_at, row.updated_at), (row.east_m, row.north_m, row.up_m)
+    query = select(row.id, row.name, *dates, *place).order_by(row.name)
     if heliostat is not None:
         query = query.where(row.id == heliostat)
     lines = []
-    for number, name, changed, *place in session.execute(query.order_by(row.name)):
+    for number, name, changed, updated_at, east, north, up in session.execute(query):
         taken, mount = photographs.get(number, none), mounted.get(number)
         corrected = max((at for at in (taken.corrected, changed) if at is not None), default=None)
         line = HeliostatOverview(
             name,
-            place[0],
-            place[1],
+            east,
+            north,
             taken.photographs,
             taken.refused,
             taken.used,
             corrected,
             surfaces.get(number),
-            range_m=min((math.dist(place, center) for center in receivers), default=None),
+            range_m=min(
+                (math.dist((east, north, up), center) for center in receivers), default=None
+            ),
             mounted=None
             if mount is None
             else MountKey(name, *mount, taken.newest, corrected, model),
             candidate=candidates.get(number),
             id=number,
+            updated_at=updated_at,
         )
         lines.append(_with_results(line, states.get(number), model))
     return lines

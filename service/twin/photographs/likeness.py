@@ -24,7 +24,7 @@ from service.twin.measurements import AcceptedMeasurement, Array, HeliostatConte
 from service.twin.photographs.metadata import Warnings
 from service.twin.photographs.readings import reading_of
 from service.twin.runtime import Runtime
-from service.twin.stored_mount import as_calibrated, mount_at, mount_of, with_drive_zeros
+from service.twin.stored_mount import mount_at, mount_of, with_drive_zeros
 from service.twin.surfaces.accuracy import usual_accuracy
 
 logger = logging.getLogger("heliotwin.service")
@@ -163,7 +163,7 @@ def _candidates(
     }
     return [
         (
-            HeliostatContext(row, as_calibrated(row, mounted.get(row.id), twin.model), twin.model),
+            HeliostatContext.of(row, mounted.get(row.id), twin.model),
             unpack(surfaces[row.id])["z"].astype(float),
         )
         for row in rows

@@ -246,20 +246,25 @@ def accuracy_series(
 
     One surface and one model forecast all photographs, so a fall is no step of them. Photographs
     that the surface was computed from do not count. ``known`` are accuracies that were computed
-    before. The result is None after a failure, which is logged.
+    before; those on arrival are known as well, if nothing changed since. The result is None after a
+    failure, which is logged.
     """
     try:
         with runtime.database.reading() as session:
             twin = load_heliostat_context(session, name)
             surface = store.find_surface_at(session, twin.row)
             rows = photographs_of_epoch(session, twin.row, epoch_of(session, twin.row, surface))
-            names = [row.identifier for row in rows if str(row.id) not in known]
+            key, found = forecast_key(twin, surface), dict(known)
+            for row in rows:
+                if row.forecast_key == key and row.forecast_accuracy is not None:
+                    found[str(row.id)] = row.forecast_accuracy
+            names = [row.identifier for row in rows if str(row.id) not in found]
             missing = store.get_measurements(session, twin.row, names, arrays=True)
         compared = compare_with(runtime, twin, surface, missing) if missing else []
     except (ModelError, ServiceError) as error:
         logger.warning("the accuracy of heliostat %s is not known: %s", name, error)
         return None
-    found = {**known, **{str(one.measurement.id): one.accuracy for one in compared}}
+    found |= {str(one.measurement.id): one.accuracy for one in compared}
     accuracies = {str(row.id): found[str(row.id)] for row in rows}
     used = photographs_of_surface(surface)
     unseen = [row for row in rows if photograph_name(row) not in used]
@@ -397,6 +402,12 @@ def accuracy_on_arrival(
     except Exception:  # the photograph must be stored, whatever fails here
         logger.exception("the drift of heliostat %s is not known", twin.row.name)
     return None
+
+
+def forecast_key(twin: HeliostatContext, surface: SurfaceRow | None) -> str:
+    """What forecasts with a stored surface are based on, besides their photographs."""
+    number = None if surface is None else surface.id
+    return result_key(number, twin.model.number, twin.mount, twin.row.updated_at)
 
 
 # Photographs on arrival whose median is the usual accuracy, and the least number of them.

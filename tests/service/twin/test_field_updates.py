@@ -135,6 +135,37 @@ def test_state_and_alarms_are_written_though_nobody_reads(
     )
 
 
+def test_accuracy_on_arrival_is_traced_again_only_after_a_change_of_what_it_is_based_on(
+    client: TestClient, model: Blind, monkeypatch: pytest.MonkeyPatch
+):
+    render, traced = model.render, list[int]()
+
+    def count(heliostat: Any, observations: Any, *others: Any, **options: Any) -> Any:
+        traced.append(len(observations))
+        return render(heliostat, observations, *others, **options)
+
+    def accuracy() -> Any:
+        until(lambda: client.get("/v1/alarms").json()["pending"] == 0)
+        (line,) = client.get("/v1/field").json()["items"]
+        return line["accuracy"]
+
+    assert accuracy() is None  # the surface was computed from the only photograph
+    monkeypatch.setattr(model, "render", count)
+    model.is_blind = True
+    photograph(client, 1)
+    poor = accuracy()
+    assert traced == [1]  # on arrival
+    model.is_blind = False
+    assert client.put("/v1/heliostats/AA39", json=properties_document()).status_code == 200
+    assert accuracy() == poor
+    changed = properties_document()
+    changed["heliostat_position"][2] += 0.1
+    answer = client.put("/v1/heliostats/AA39?reason=surveyed", json=changed)
+    assert answer.status_code == 200, answer.text
+    assert accuracy() > poor
+    assert sum(traced) == 3  # both photographs again
+
+
 @pytest.fixture
 def stale(store_url: URL, tmp_path: Path) -> Iterator[Runtime]:
     """A store with a heliostat that nobody photographed for a year, and no service beside it."""
