@@ -440,14 +440,14 @@ class _Passed(NamedTuple):
 
     Attributes
     ----------
-    places : (B, 2, P)
+    places : float32 (B, 2, P)
         Right and down of the images' middles, in halves of their sides.
-    factors : (B, P)
+    factors : float32 (B, P)
         As of `Kernels`.
     """
 
-    places: Array
-    factors: Array
+    places: NDArray[np.float32]
+    factors: NDArray[np.float32]
 
     def n_lit(self) -> NDArray[np.int64]:
         """Number of pixels (B,) that each mirror lights."""
@@ -463,19 +463,32 @@ class _Passed(NamedTuple):
 
 def _passed(images: MirrorImages, receiver: Receiver, grid: SurfaceGrid) -> Iterator[_Passed]:
     """Follow light from a few mirrors at a time to all pixels."""
-    step = max(1, _PART // (8 * grid.areas.size))
-    axes, mirrors, aims, sides = (
-        getattr(images, name).double().numpy() for name in ("axes", "mirrors", "aims", "sides")
-    )
+    most = _PART // 8
+    step, n_rows = max(1, most // grid.areas.size), max(1, most // grid.areas.shape[1])
+    bands = [
+        SurfaceGrid(*(of_map[start : start + n_rows] for of_map in grid))
+        for start in range(0, len(grid.areas), n_rows)
+    ]
     for start in range(0, len(images), step):
         rows = slice(start, start + step)
-        planes = replace(receiver.touching(mirrors[rows]), axes=axes[rows])
-        given = (mirrors[rows], aims[rows], axes[rows], grid.points, grid.normals)
-        passed = passages(*(torch.tensor(one) for one in given))
-        places = torch.stack([passed.right, passed.up], dim=1).flatten(2).numpy()
-        factors = passed.gain.flatten(1).numpy()
-        factors = factors * _open(planes, places, aims[rows], mirrors[rows], grid)
-        yield _Passed(places * (2 / sides[rows, None, None] * [[1], [-1]]), factors)
+        axes, mirrors, aims, sides = (
+            getattr(images, name)[rows].double().numpy()
+            for name in ("axes", "mirrors", "aims", "sides")
+        )
+        planes = replace(receiver.touching(mirrors), axes=axes)
+        parts = [_passed_to(band, mirrors, aims, planes) for band in bands]
+        places, factors = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
+        places *= 2 / sides[:, None, None] * [[1], [-1]]
+        yield _Passed(places, factors)
+
+
+def _passed_to(band: SurfaceGrid, mirrors: Array, aims: Array, planes: TouchingPlanes) -> _Passed:
+    """Follow light from mirrors (B, 3) to part of the pixels; places are in metres."""
+    given = (mirrors, aims, planes.axes, band.points, band.normals)
+    passed = passages(*(torch.tensor(one) for one in given))
+    places = torch.stack([passed.right, passed.up], dim=1).flatten(2).numpy()
+    factors = passed.gain.flatten(1).numpy() * _open(planes, places, aims, mirrors, band)
+    return _Passed(places.astype(np.float32), factors.astype(np.float32))
 
 
 def _filled(parts: Iterable[_Lit], mirrors: int, count: int) -> _Lit:
