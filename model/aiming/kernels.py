@@ -143,11 +143,14 @@ class MirrorImages:
         """Find the pixels of a receiver's map of (rows, columns) that each mirror can light."""
         grid = receiver.grid(*resolution)
         most = max(1, *(int(part.n_lit().max()) for part in _passed(self, receiver, grid)))
+        is_whole = most == grid.areas.size
         parts = (part.lit(most) for part in _passed(self, receiver, grid))
-        lit = _filled(parts, len(self), most)
+        lit = _filled(parts, len(self), most, is_whole)
         areas = torch.tensor(grid.areas.reshape(-1), dtype=torch.float32)
         images = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Kernels(**images, **lit._asdict(), areas=areas, resolution=resolution)
+        return Kernels(
+            **images, **lit._asdict(), areas=areas, resolution=resolution, is_whole=is_whole
+        )
 
 
 _OF_MIRRORS = tuple(field.name for field in fields(MirrorImages) if field.name != "names")
@@ -171,6 +174,8 @@ class Kernels(MirrorImages):
         Of the map's pixels.
     resolution : (rows, columns)
         Of the map, P = rows * columns.
+    is_whole : bool
+        Whether a mirror lights all pixels. Then all have all of them, in the map's order.
     """
 
     places: Tensor
@@ -178,6 +183,7 @@ class Kernels(MirrorImages):
     pixels: Tensor
     areas: Tensor
     resolution: tuple[int, int]
+    is_whole: bool
 
     def flux(
         self, moved: Tensor, weights: Tensor | None = None, *, is_sharp: bool = False
@@ -196,8 +202,14 @@ class Kernels(MirrorImages):
                 values = checkpoint(light, moved[rows], use_reentrant=False)
             if weights is not None:
                 values = values * weights[rows, None]
-            total = total.index_add(0, part.pixels.flatten(), values.flatten())
+            total = part.add_to(total, values)
         return total
+
+    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
+        """A map (P,) with the values (N, M) of the mirrors' pixels added to it."""
+        if self.is_whole:
+            return total + values.sum(dim=0)
+        return total.index_add(0, self.pixels.flatten(), values.flatten())
 
     def light(self, moved: Tensor, *, is_sharp: bool = False) -> Tensor:
         """Irradiance (N, M) [W/m2] of each mirror in the pixels that it can light."""
@@ -238,12 +250,17 @@ class Kernels(MirrorImages):
 
     def on_pixels(self, kept: Tensor) -> "Kernels":
         """The same images on pixels ``kept`` (K,) of the map, whose resolution stays."""
+        areas = self.areas[kept]
+        if self.is_whole:
+            places, factors = self.places[:, :, kept], self.factors[:, kept]
+            pixels = self.pixels[:, : len(kept)]
+            return replace(self, places=places, factors=factors, pixels=pixels, areas=areas)
         number = torch.full((len(self.areas),), -1, dtype=torch.int32)
         number[kept] = torch.arange(len(kept), dtype=torch.int32)
         most = max(1, *(int(part._is_lit(number).sum(dim=1).max()) for part, _ in self.parts()))
         parts = (part._numbered(number, most) for part, _ in self.parts())
         lit = _filled(parts, len(self), most)
-        return replace(self, **lit._asdict(), areas=self.areas[kept])
+        return replace(self, **lit._asdict(), areas=areas)
 
     def _is_lit(self, number: Tensor) -> Tensor:
         """Whether mirrors light their pixels (N, M), and these have a new number."""
@@ -454,7 +471,13 @@ class _Passed(NamedTuple):
         return np.asarray((self.factors > 0).sum(axis=1))
 
     def lit(self, count: int) -> _Lit:
-        """Those pixels, before others that a mirror does not light, ``count`` of each mirror."""
+        """Those pixels, before others that a mirror does not light, ``count`` of each mirror.
+
+        All pixels stay in their order.
+        """
+        if count == self.factors.shape[1]:
+            pixels = np.arange(count)
+            return _Lit(*(torch.tensor(one) for one in (self.places, self.factors, pixels)))
         chosen = np.argsort(self.factors <= 0, axis=1, kind="stable")[:, :count]
         places = np.take_along_axis(self.places, chosen[:, None], axis=2)
         factors = np.take_along_axis(self.factors, chosen, axis=1)
@@ -491,20 +514,21 @@ def _passed_to(band: SurfaceGrid, mirrors: Array, aims: Array, planes: TouchingP
     return _Passed(places.astype(np.float32), factors.astype(np.float32))
 
 
-def _filled(parts: Iterable[_Lit], mirrors: int, count: int) -> _Lit:
-    """Join the pixels of a few mirrors at a time, ``count`` of each mirror, in single precision."""
-    whole = _Lit(
-        torch.zeros(mirrors, 2, count),
-        torch.zeros(mirrors, count),
-        torch.zeros(mirrors, count, dtype=torch.int32),
-    )
+def _filled(parts: Iterable[_Lit], mirrors: int, count: int, is_whole: bool = False) -> _Lit:
+    """Join the pixels of a few mirrors at a time, ``count`` of each mirror, in single precision.
+
+    If it ``is_whole``, one row of pixels serves all mirrors.
+    """
+    places, factors = torch.zeros(mirrors, 2, count), torch.zeros(mirrors, count)
+    pixels = torch.arange(count, dtype=torch.int32).repeat(1 if is_whole else mirrors, 1)
     start = 0
     for part in parts:
-        rows = slice(start, start + len(part.pixels))
-        for values, of_part in zip(whole, part, strict=True):
-            values[rows] = of_part
+        rows = slice(start, start + len(part.factors))
+        places[rows], factors[rows] = part.places, part.factors
+        if not is_whole:
+            pixels[rows] = part.pixels
         start = rows.stop
-    return whole
+    return _Lit(places, factors, pixels.expand(mirrors, -1))
 
 
 def _open(

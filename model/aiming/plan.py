@@ -415,8 +415,11 @@ def _changes(plan: AimPlan, axis: int, variance: Tensor) -> Tensor:
             moved, shift = plan.moved[rows], part.spread[:, :, axis] / 2
             change = part.light(moved + shift) - part.light(moved - shift)
             change *= plan.is_active[rows, None]
-            variance.index_add_(0, part.pixels.flatten(), (change**2).flatten())
-            changes[rows].scatter_add_(1, part.pixels.long(), change)
+            variance.copy_(part.add_to(variance, change**2))
+            if part.is_whole:
+                changes[rows] = change
+            else:
+                changes[rows].scatter_add_(1, part.pixels.long(), change)
     return changes
 
 

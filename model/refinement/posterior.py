@@ -14,6 +14,7 @@ Image i contributes ``information F_i = J_i' J_i`` and ``score g_i = J_i' r_i``.
 first index of a Jacobian is the coefficient.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -196,11 +197,10 @@ class Linearization:
             self.covariance - (self.covariance * self.hyper.precision) @ self.covariance
         )
 
-    @cached_property
-    def information(self) -> Array:
-        """F_i (M, K, K) of each image."""
-        of_image = self.jacobian.swapaxes(0, 1)
-        return np.asarray(of_image @ of_image.swapaxes(1, 2), dtype=np.float64)
+    def information(self) -> Iterator[Array]:
+        """F_i (K, K) of each image in turn; those of 64 images together would be 200 MB."""
+        for of_image in self.jacobian.swapaxes(0, 1):
+            yield (of_image @ of_image.T).astype(np.float64)
 
     @cached_property
     def scores(self) -> Array:
@@ -210,7 +210,7 @@ class Linearization:
 
     def information_shares(self) -> Array:
         """Share (M,) of each image in tr(C F_i), the number of determined coefficients."""
-        determined = np.einsum("mij,ji->m", self.information, self.covariance)
+        determined = np.array([(one * self.covariance).sum() for one in self.information()])
         return np.asarray(determined / determined.sum())
 
     def estimate_sigma(self) -> Array:
@@ -235,7 +235,7 @@ class Linearization:
         Errors that look like a bent mirror make it larger than one (quasi-likelihood, Wedderburn
         1974, doi:10.1093/biomet/61.3.439).
         """
-        determined = (self.covariance @ of_image for of_image in self.information)
+        determined = (self.covariance @ of_image for of_image in self.information())
         expected = sum(float(np.trace(one) - (one * one.T).sum()) for one in determined)
         return float(
             np.einsum("mi,ij,mj->", self.scores, self.covariance, self.scores) / max(expected, 1.0)
@@ -261,7 +261,7 @@ class Linearization:
         The surface without image i differs by ``(I - C F_i)^-1 C g_i``.
         """
         identity = np.eye(len(self.covariance))
-        others = (identity - of_image @ self.covariance for of_image in self.information)
+        others = (identity - of_image @ self.covariance for of_image in self.information())
         change = np.array([*map(np.linalg.solve, others, self.scores)]) @ self.covariance
         return np.asarray(
             self.residual + np.einsum("mk,kmn->mn", change, self.jacobian, optimize=True)

@@ -44,6 +44,7 @@ def one_pixel_kernels(right: float, down: float) -> Kernels:
         pixels=torch.zeros(1, 1, dtype=torch.int32),
         areas=torch.ones(1),
         resolution=(1, 1),
+        is_whole=False,
     )
 
 

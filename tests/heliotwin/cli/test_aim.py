@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +236,23 @@ def test_images_of_half_as_many_pixels_have_the_same_light(
     assert float((maps[1] - maps[0]).abs().sum()) < 0.02 * float(maps[0].sum())
     assert float(maps[1].max()) == pytest.approx(float(maps[0].max()), rel=0.03)
     assert bounds[1] == pytest.approx(bounds[0], rel=0.01)
+
+
+def test_one_row_of_pixels_serves_all_mirrors_of_a_map_that_they_light_whole(plant: Path):
+    request = FieldRequest("board", 180.0, 55.0, 900.0, resolution=(17, 32))
+    whole = trace_kernels(read_plant(plant), request, no_progress).kernels
+    assert whole.is_whole
+    assert whole.pixels.untyped_storage().nbytes() == 4 * 17 * 32
+    each = replace(whole, is_whole=False, pixels=whole.pixels.contiguous())
+    limit = torch.full_like(whole.areas, 30e3)
+    one, other = (single_aim(kernels, limit) for kernels in (whole, each))
+    torch.testing.assert_close(one.flux, other.flux)
+    drawn, expected = linear_draws(one), linear_draws(other)
+    torch.testing.assert_close(drawn.sigma, expected.sigma)
+    np.testing.assert_allclose(drawn.ratios, expected.ratios, rtol=1e-5)
+    thin, rough = (plan.kernels.thinned().kernels for plan in (one, other))
+    moved = torch.full((len(whole), 2), 0.5)
+    torch.testing.assert_close(thin.flux(moved), rough.flux(moved))
 
 
 def test_parts_of_the_kernels_do_not_change_a_plan(plant: Path, monkeypatch: pytest.MonkeyPatch):
