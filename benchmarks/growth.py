@@ -40,6 +40,7 @@ from service.store.columns import Base, now
 from service.store.database import Database
 from service.store.image_files import digest
 from service.store.job_tables import JobStepRow
+from service.store.listing import Portion
 from service.store.surface_versions import NewSurface
 from service.store.tables import ForecastRow, ImageRow, MeasurementRow
 from service.twin import operations
@@ -349,8 +350,8 @@ def questions(filler: Filler) -> dict[str, Callable[[Session], Any]]:
         "the field's page, all statements": lambda s: read_summaries(s),
         "100 heliostats, 100 jobs, 100 forecasts": lambda s: (
             store.list_heliostats(s, 100),
-            queue.list_jobs(s, 100),
-            store.list_forecasts(s, 100),
+            queue.list_jobs(s, Portion(100)),
+            store.list_forecasts(s, Portion(100)),
         ),
         "sizes, as /jobs and /metrics report them": lambda s: sizes.sizes(s),
         "is a pruning due, for age or quota": lambda s: image_files.has_candidates(

@@ -55,6 +55,21 @@ class Period:
 EVER = Period()
 
 
+@dataclass(frozen=True)
+class Portion:
+    """Up to ``limit`` rows of a list after the row with id ``after``, of those of a period."""
+
+    limit: int
+    after: int | None = None
+    created: Period = EVER
+    order: Order = NEWEST_FIRST
+
+    def of(self, session: Session, query: Select[Row], table: Any) -> Select[Row]:
+        """Restrict a query of ``table``; raises what `select_after` raises."""
+        query = query.where(*self.created.conditions(table.created_at)).limit(self.limit)
+        return select_after(session, query, table, self.order, self.after)
+
+
 def select_after(
     session: Session, query: Select[Row], table: Any, order: Order, after: int | None
 ) -> Select[Row]:

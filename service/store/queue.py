@@ -25,7 +25,7 @@ from sqlalchemy.orm import Session, aliased, defer, undefer
 from service.base.errors import ConflictError, IdempotencyReuseError, NotFoundError, TooManyError
 from service.store.columns import now
 from service.store.job_tables import JobRow, JobStepRow
-from service.store.listing import NEWEST_FIRST, Order, Period, select_after
+from service.store.listing import Portion
 from service.store.rows import Added, insert
 
 ENDED = ("done", "failed", "cancelled")
@@ -183,27 +183,13 @@ def get_summary(session: Session, number: int) -> JobRow:
 
 
 def list_jobs(
-    session: Session,
-    limit: int,
-    after: int | None = None,
-    state: str | None = None,
-    kind: str | None = None,
-    *,
-    created: Period = Period(),
-    order: Order = NEWEST_FIRST,
+    session: Session, portion: Portion, state: str | None = None, kind: str | None = None
 ) -> Sequence[JobRow]:
-    """Up to ``limit`` jobs after job ``after``, without payload and result, newest first by
-    default.
-    """
-    query = (
-        select(JobRow)
-        .options(*_IN_SHORT)
-        .where(*created.conditions(JobRow.created_at))
-        .limit(limit)
-    )
+    """A portion of the jobs, without payload and result."""
+    query = select(JobRow).options(*_IN_SHORT)
     for column, wanted in ((JobRow.state, state), (JobRow.kind, kind)):
         query = query if wanted is None else query.where(column == wanted)
-    return session.scalars(select_after(session, query, JobRow, order, after)).all()
+    return session.scalars(portion.of(session, query, JobRow)).all()
 
 
 def cancel(session: Session, number: int) -> JobRow:

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session, joinedload, lazyload, load_only, undefer
 from service.base.errors import NotFoundError
 from service.store.columns import Base
 from service.store.job_tables import JobRow
-from service.store.listing import NEWEST_FIRST, Order, Period, select_after
+from service.store.listing import Portion
 from service.store.plant import get_target
 from service.store.queue import KEPT
 from service.store.rows import lock_row
@@ -64,28 +64,17 @@ def get_forecast(session: Session, number: int) -> ForecastRow:
 
 def list_forecasts(
     session: Session,
-    limit: int,
-    after: int | None = None,
+    portion: Portion,
     heliostat: HeliostatRow | None = None,
-    *,
     target: str | None = None,
-    created: Period = Period(),
-    order: Order = Order(),
 ) -> Sequence[ForecastRow]:
-    """Up to ``limit`` forecasts after number ``after``, in order of creation or in another
-    ``order``.
-    """
-    query = (
-        select(ForecastRow)
-        .options(*_NAMES)
-        .where(*created.conditions(ForecastRow.created_at))
-        .limit(limit)
-    )
+    """A portion of the forecasts."""
+    query = select(ForecastRow).options(*_NAMES)
     if heliostat is not None:
         query = query.where(ForecastRow.heliostat_id == heliostat.id)
     if target is not None:
         query = query.where(ForecastRow.target_name == get_target(session, target).name)
-    return session.scalars(select_after(session, query, ForecastRow, order, after)).all()
+    return session.scalars(portion.of(session, query, ForecastRow)).all()
 
 
 @dataclass(frozen=True)
@@ -217,19 +206,13 @@ def has_study_page(session: Session, number: int) -> bool:
 
 
 def list_studies(
-    session: Session,
-    limit: int,
-    after: int | None = None,
-    *,
-    verdict: str | None = None,
-    created: Period = Period(),
-    order: Order = NEWEST_FIRST,
+    session: Session, portion: Portion, verdict: str | None = None
 ) -> Sequence[StudyRow]:
-    """Up to ``limit`` studies after study ``after``, without reports, newest first by default."""
-    query = select(StudyRow).where(*created.conditions(StudyRow.created_at)).limit(limit)
+    """A portion of the studies, without reports."""
+    query = select(StudyRow)
     if verdict is not None:
         query = query.where(StudyRow.verdict == verdict)
-    return session.scalars(select_after(session, query, StudyRow, order, after)).all()
+    return session.scalars(portion.of(session, query, StudyRow)).all()
 
 
 @dataclass(frozen=True)

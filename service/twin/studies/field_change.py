@@ -24,6 +24,7 @@ from model.study.judging import Gain, few_gain, find_end, is_worse
 from service import store
 from service.base.errors import ConflictError, ServiceError
 from service.base.fields import MeanGain
+from service.store.listing import Portion
 from service.store.tables import HeliostatRow, MeasurementRow, StudyRow, SurfaceRow
 from service.twin import model_versions
 from service.twin.adoption_rules import is_ambiguous
@@ -370,7 +371,7 @@ class EffectWatch:
         They are the reason to adopt what leaves most of the error.
         """
         with self._runtime.database.reading() as session:
-            studies = store.list_studies(session, _RECENT)
+            studies = store.list_studies(session, Portion(_RECENT))
             states = study_states(session, studies)
         return next((one for row in studies if (one := self._adoptable(row, states[row.id]))), None)
 

@@ -288,17 +288,15 @@ def result_key(*parts: datetime | int | None) -> str:
 class ComparisonKey:
     """What a heliostat's comparisons depend on.
 
-    ``surface`` is a version, None for the ideal mirror. ``span`` is when the photographs were
-    taken; None means the newest ones.
+    ``surface`` is a version, None for the ideal mirror. ``based_on`` changes with photographs,
+    properties, mount and model. ``span`` is when the photographs were taken; None means the newest
+    ones.
     """
 
     heliostat: str
     surface: int | None
-    newest: int
-    corrected: datetime | None
-    model: int
-    calibrated_at: datetime | None = None
-    span: Period | None = None
+    based_on: str
+    span: Period | None
 
 
 @dataclass(frozen=True)
@@ -327,33 +325,21 @@ class ComparisonCache:
         span: Period | None = None,
     ) -> ComparisonKey | None:
         """What the comparisons with a surface depend on now; None without a photograph."""
-        photographs = select(func.max(MeasurementRow.id)).where(
-            MeasurementRow.heliostat_id == heliostat.id
-        )
-        newest = session.scalar(photographs.where(MeasurementRow.accepted))
+        row, is_own = MeasurementRow, MeasurementRow.heliostat_id == heliostat.id
+        newest = session.scalar(select(func.max(row.id)).where(is_own, row.accepted))
         if newest is None:
             return None
-        corrections = select(func.max(MeasurementRow.corrected_at)).where(
-            MeasurementRow.heliostat_id == heliostat.id
-        )
-        changed = session.scalar(
-            select(HeliostatRow.photographs_changed_at).where(HeliostatRow.id == heliostat.id)
-        )
-        calibrations = select(func.max(MountRow.created_at)).where(
-            MountRow.heliostat_id == heliostat.id
-        )
-        return ComparisonKey(
-            heliostat.name,
-            None if surface is None else surface.version,
+        mounts = select(func.max(MountRow.id)).where(MountRow.heliostat_id == heliostat.id)
+        based_on = result_key(
             newest,
-            max(
-                (at for at in (session.scalar(corrections), changed) if at is not None),
-                default=None,
-            ),
+            session.scalar(select(func.max(row.corrected_at)).where(is_own)),
+            heliostat.photographs_changed_at,
+            heliostat.updated_at,
+            session.scalar(mounts),
             model_versions.current_number(session),
-            session.scalar(calibrations),
-            span,
         )
+        version = None if surface is None else surface.version
+        return ComparisonKey(heliostat.name, version, based_on, span)
 
     def wait_for(self, key: ComparisonKey, seconds: float = 5.0) -> ComparisonResult | None:
         """The comparisons; None if they are not ready after ``seconds``."""

@@ -212,15 +212,9 @@ def list_forecasts(
 ) -> Page[ForecastSummary]:
     """List forecasts, in the order of their creation."""
     with runtime.database.reading() as session:
-        rows = store.list_forecasts(
-            session,
-            query.limit + 1,
-            query.after,
-            None if query.heliostat is None else store.get_heliostat(session, query.heliostat),
-            target=query.target,
-            created=query.created,
-            order=query.by_id,
-        )
+        name = query.heliostat
+        heliostat = None if name is None else store.get_heliostat(session, name)
+        rows = store.list_forecasts(session, query.portion, heliostat, query.target)
     return page([forecast_summary(row) for row in rows], query.limit)
 
 

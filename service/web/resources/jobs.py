@@ -230,15 +230,7 @@ class JobsQuery(ListQuery):
 def list_jobs(query: Annotated[JobsQuery, Query()], runtime: RuntimeDep) -> Page[JobSummary]:
     """List jobs, newest first. The complete job is at its `href`."""
     with runtime.database.reading() as session:
-        rows = queue.list_jobs(
-            session,
-            query.limit + 1,
-            query.after,
-            query.state,
-            query.kind,
-            created=query.created,
-            order=query.by_id,
-        )
+        rows = queue.list_jobs(session, query.portion, query.state, query.kind)
     return page([job_summary(row) for row in rows], query.limit)
 
 

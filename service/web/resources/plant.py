@@ -335,7 +335,6 @@ def put_target(
 @router.delete(
     "/targets/{name}",
     status_code=status.HTTP_204_NO_CONTENT,
-    response_class=Response,
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
@@ -388,7 +387,6 @@ def put_receiver(
 @router.delete(
     "/receivers/{name}",
     status_code=status.HTTP_204_NO_CONTENT,
-    response_class=Response,
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )

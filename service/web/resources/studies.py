@@ -368,14 +368,7 @@ def list_studies(
 ) -> Page[StudySummary]:
     """List studies, newest first."""
     with runtime.database.reading() as session:
-        rows = store.list_studies(
-            session,
-            query.limit + 1,
-            query.after,
-            verdict=query.verdict,
-            created=query.created,
-            order=query.by_id,
-        )
+        rows = store.list_studies(session, query.portion, query.verdict)
         return page(_summaries(session, rows), query.limit)
 
 

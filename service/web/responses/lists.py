@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from model.times import format_time
 from service.base.fields import Model, Moment, Version
 from service.drawing.templates import Quantity
-from service.store.listing import Order, Period
+from service.store.listing import Order, Period, Portion
 from service.web.auth.dependencies import Limit
 
 Item = TypeVar("Item")
@@ -43,14 +43,10 @@ class ListQuery(Model, extra="ignore"):
     order: OrderQuery = "up"
 
     @property
-    def created(self) -> Period:
-        """When the items were created."""
-        return Period(self.since, self.until)
-
-    @property
-    def by_id(self) -> Order:
-        """The order for the store."""
-        return Order(descending=self.order == "down")
+    def portion(self) -> Portion:
+        """The rows of a page, and one more if there is another page."""
+        created, order = Period(self.since, self.until), Order(descending=self.order == "down")
+        return Portion(self.limit + 1, self.after, created, order)
 
 
 class Page(BaseModel, Generic[Item]):

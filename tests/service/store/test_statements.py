@@ -11,6 +11,7 @@ from service import store
 from service.store.check import inspect_store
 from service.store.database import Database
 from service.store.image_files import ImageStore
+from service.store.listing import Portion
 from service.twin import model_versions
 from service.twin.measurements import named_measurements
 from service.twin.studies.study import StudyIn, load_study_inputs
@@ -23,7 +24,7 @@ from tests.service.studies import GAMMA, add, adopt
 def test_forecasts_are_listed_without_what_hangs_on_them(database: Database):
     fill(database, 12)
     with database.reading() as session, statements(database) as sent:
-        rows = store.list_forecasts(session, 50)
+        rows = store.list_forecasts(session, Portion(50))
         assert [(row.heliostat.name, row.surface.version) for row in rows if row.surface] == [
             ("AA39", 1)
         ] * 12

@@ -31,6 +31,7 @@ from service.store import keys, queue
 from service.store.columns import now
 from service.store.image_files import digest
 from service.store.job_tables import JobRow
+from service.store.listing import Portion
 from service.store.tables import ImageRow
 from service.twin import importing
 from service.web.app import create_app
@@ -485,7 +486,7 @@ class Steps:
 
     def note(self) -> None:
         with self._database.reading() as session:
-            row = queue.list_jobs(session, 1)[0]
+            row = queue.list_jobs(session, Portion(1))[0]
             has_estimate = row.remaining_s is not None and row.remaining_s > 0
             self.shown.append((row.phase, row.n_done, row.n_total, has_estimate))
 
