@@ -50,7 +50,7 @@ STARTS = (-0.4, -0.15, -0.05, 0.05, 0.15, 0.4)
 WORST_START = 3
 """Cost of a start, in costs of the best one, above which no fit begins there."""
 
-AT_ONCE, MAX_IMAGES_AT_ONCE = 8, 2048
+AT_ONCE, MAX_IMAGES_AT_ONCE = 8, 1024
 """Forecasts of all images that are traced at once, where they differ in mirrors alone; and the most
 images of them.
 """

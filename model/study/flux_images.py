@@ -159,11 +159,11 @@ def without_hot_pixels(flux_images: Sequence[FluxImage]) -> list[FluxImage]:
             cameras.setdefault((plane.name, one.image.shape), []).append(row)
     found = list(flux_images)
     for rows in cameras.values():
-        images = [np.asarray(found[row].image, dtype=np.float64) for row in rows]
-        hot = hot_pixels(images)
+        hot = hot_pixels([found[row].image for row in rows])
         if not hot.any():
             continue
-        for row, image in zip(rows, images, strict=True):
+        for row in rows:
+            image = found[row].image.astype(np.float64)
             repaired = np.where(hot, median_filter(image, AROUND), image)
             share = float(np.abs(repaired - image).sum() / image.sum())
             if share > MIN_HOT:
@@ -191,7 +191,7 @@ def centers(images: NDArray[np.floating], planes: Sequence[TargetPlane]) -> Arra
     InvalidInputError
         Where an image holds no energy.
     """
-    across, along = images.sum(axis=1), images.sum(axis=2)
+    across, along = (images.sum(axis=axis, dtype=np.float64) for axis in (1, 2))
     total = across.sum(axis=1)
     if not (total > 0).all():
         raise InvalidInputError("an image without energy has no centre of mass")

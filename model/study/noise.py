@@ -62,11 +62,11 @@ def spikes(image: Array) -> NDArray[np.bool_]:
     return found.reshape(image.shape)
 
 
-def hot_pixels(images: Sequence[Array]) -> NDArray[np.bool_]:
+def hot_pixels(images: Sequence[NDArray[np.floating]]) -> NDArray[np.bool_]:
     """Pixels (rows, columns) that are `spikes` of most images; none of fewer than `MIN_IMAGES`."""
     if len(images) < MIN_IMAGES:
         return np.zeros(images[0].shape, dtype=bool)
-    return np.asarray(np.mean([spikes(image) for image in images], axis=0) > 0.5)
+    return np.asarray(np.mean([spikes(image.astype(np.float64)) for image in images], axis=0) > 0.5)
 
 
 def grain_variance(image: Array, spacing: int = SPACING) -> Array:

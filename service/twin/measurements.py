@@ -162,7 +162,7 @@ class AcceptedMeasurement:
         )
         return FluxImage(
             shot,
-            np.asarray(image, dtype=np.float64),
+            image,
             seen=seen,
             is_estimated=is_estimated,
             clipped=clipped,
