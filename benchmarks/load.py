@@ -5,6 +5,10 @@ Each client does what clients of a plant do, one thing after the other with a pa
 photographs (real ones of the Solar Tower Juelich, each made another by a little noise), reads,
 predicts, forecasts, looks at pages. Prints answers, errors and times by what was asked, and the
 memory of the service. The clients run on the same machine.
+
+``--in-turn N`` sends N requests of each kind instead, one after the other, and prints what each
+takes of the processor, with what the service does in the background because of it. To compare two
+commits, run both in turns on an idle machine (``load-in-turn``).
 """
 
 import argparse
@@ -33,6 +37,8 @@ from tests.faults.harness import ROOT, Process, Store, new_store
 from tests.service.conftest import metadata_of
 
 HELIOSTATS = ("AA39", "AC43")
+_SETTLE_S = 3.0
+"""Time after requests in which the background work that they cause is done."""
 SUN = {"azimuth_deg": 200.0, "elevation_deg": 45.0}
 
 
@@ -170,6 +176,25 @@ async def _visits(service: Process, tally: Tally, options: argparse.Namespace) -
     return memory
 
 
+async def _in_turn(service: Process, count: int) -> None:
+    """Send ``count`` requests of each kind, one after the other, and print what they take."""
+    async with httpx.AsyncClient(base_url=service.base, timeout=120) as http:
+        visitor = Visitor(http, Tally(), 7)
+        for action in (visitor.photograph, visitor.read, visitor.page, visitor.forecast):
+            begun = _cpu_s(service.number)
+            for _ in range(count):
+                await visitor.ask(action)
+            await asyncio.sleep(_SETTLE_S)
+            name = action.__name__
+            row = {
+                "median answer [ms]": 1e3 * float(np.median(visitor.tally.times[name])),
+                "processor time [ms]": 1e3 * (_cpu_s(service.number) - begun) / count,
+            }
+            print(f"{name:12}" + ", ".join(f"{what} {value:.1f}" for what, value in row.items()))
+            log_row("Requests in turn", name, row, n=count, of="requests")
+        assert not visitor.tally.failures, visitor.tally.failures
+
+
 def _status(number: int, name: str) -> float:
     """A figure of the process's memory [MB]."""
     text = Path(f"/proc/{number}/status").read_text()
@@ -267,6 +292,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--pause", type=float, default=2.0, help="mean pause of a client between two requests [s]"
     )
+    parser.add_argument("--in-turn", type=int, metavar="N", help="send N of each kind in turn")
     options = parser.parse_args(arguments)
     if not data_folder().is_dir():
         parser.error(f"no real measurements at {data_folder()}; set HELIOTWIN_STJ")
@@ -285,12 +311,15 @@ def main(arguments: list[str]) -> None:
             "HELIOTWIN_JOB_LEASE_S": "30",
             "HELIOTWIN_JOB_POLL_S": "0.5",
         }
-        minutes = round(options.seconds / 60)
+        what = f"{options.database}-{options.clients}-clients-{round(options.seconds / 60)}-minutes"
         with (
             Process(store, "serve", module="service", **extra) as service,
-            recording(f"load-{options.database}-{options.clients}-clients-{minutes}-minutes"),
+            recording(f"load-{what if options.in_turn is None else 'in-turn'}"),
         ):
             asyncio.run(_warm_up(service.base))
+            if options.in_turn is not None:
+                asyncio.run(_in_turn(service, options.in_turn))
+                return
             tally, number = Tally(), service.number
             memory, cpu_s = {"before": _status(number, "VmRSS")}, _cpu_s(number)
             own = resource.getrusage(resource.RUSAGE_SELF).ru_utime
