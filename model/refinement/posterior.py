@@ -198,7 +198,7 @@ class Linearization:
         )
 
     def information(self) -> Iterator[Array]:
-        """F_i (K, K) of each image in turn; those of 64 images together would be 200 MB."""
+        """F_i (K, K) of each image in turn; those of 64 images together would be 230 MB."""
         for of_image in self.jacobian.swapaxes(0, 1):
             yield (of_image @ of_image.T).astype(np.float64)
 

@@ -76,7 +76,7 @@ _Corners = dict[Literal["corners"], tuple[_Pixel, _Pixel, _Pixel, _Pixel]]
 _Unlike = create_model("Unlike", detail=(Text, ...), like=(Name, ...))
 _Photograph = record(
     MeasurementRow,
-    (*_MEASURED, "sun_azimuth_deg", "sun_elevation_deg"),
+    (*_MEASURED, "sun_azimuth_deg", "sun_elevation_deg", "forecast_key"),
     kind=(ImageKind | Literal["none"], ...),
     target=(str, ...),
     image=(_FILE | None, ...),

@@ -36,6 +36,7 @@ NOT_EXPORTED: dict[str, frozenset[str]] = {
     "receivers": frozenset({"updated_at"}),
     # How long an image is kept: when it came to this store, and whether it was accepted then.
     "images": frozenset({"created_at", "accepted"}),
+    "measurements": frozenset({"forecast_key"}),  # row ids
 }
 """Tables, or columns of them, that an export leaves out by design."""
 

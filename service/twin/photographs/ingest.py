@@ -341,8 +341,8 @@ def _forecast_accuracy(runtime: Runtime, known: _Known, row: MeasurementRow) -> 
     judged = row.forecast_accuracy = accuracy.accuracy_on_arrival(
         runtime, known.twin, known.surface, accepted
     )
-    row.forecast_key = accuracy.forecast_key(known.twin, known.surface)
     if judged is not None:
+        row.forecast_key = accuracy.forecast_key(known.twin, known.surface)
         unlike = unlike_warnings(runtime, known.twin, row, accepted, judged)
         row.warnings = [*(row.warnings or ()), *unlike] or None
     return judged
