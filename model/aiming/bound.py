@@ -26,7 +26,7 @@ _MIRRORS = 256
 _STEPS = 6
 _STEP = 0.05
 
-_LOOSE = 1.05
+_LOOSE = 1.01
 _SHARES = (1.0, 0.3, 0.1, 0.0)
 """Shares of the plan's multipliers that are tried if its bound is above `_LOOSE` of its power."""
 
