@@ -251,6 +251,7 @@ def put_heliostat(
 @router.delete(
     "/heliostats/{name}",
     status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )

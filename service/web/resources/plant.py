@@ -335,6 +335,7 @@ def put_target(
 @router.delete(
     "/targets/{name}",
     status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
@@ -387,6 +388,7 @@ def put_receiver(
 @router.delete(
     "/receivers/{name}",
     status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
     responses=problems(404, 409),
     dependencies=[OPERATE],
 )
