@@ -202,14 +202,11 @@ class Kernels(MirrorImages):
                 values = checkpoint(light, moved[rows], use_reentrant=False)
             if weights is not None:
                 values = values * weights[rows, None]
-            total = part.add_to(total, values)
+            if self.is_whole:
+                total = total + values.sum(dim=0)
+            else:
+                total = total.index_add(0, part.pixels.flatten(), values.flatten())
         return total
-
-    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
-        """A map (P,) with the values (N, M) of the mirrors' pixels added to it."""
-        if self.is_whole:
-            return total + values.sum(dim=0)
-        return total.index_add(0, self.pixels.flatten(), values.flatten())
 
     def light(self, moved: Tensor, *, is_sharp: bool = False) -> Tensor:
         """Irradiance (N, M) [W/m2] of each mirror in the pixels that it can light."""

@@ -396,30 +396,28 @@ def _draws_on(plan: AimPlan, band: Tensor, errors: Tensor) -> LinearDraws:
     limit = plan.limit[band]
     if len(band) < len(plan.limit):
         plan = replace(plan, kernels=plan.kernels.on_pixels(band))
-    drawn, variance = torch.zeros(len(errors), len(band)), torch.zeros(len(band))
+    drawn, sigma = torch.zeros(len(errors), len(band)), torch.zeros(len(band))
     for axis in range(2):
-        drawn.addmm_(errors[:, :, axis], _changes(plan, axis, variance))
+        changes = _changes(plan, axis)
+        drawn.addmm_(errors[:, :, axis], changes)
+        sigma = torch.hypot(sigma, changes.norm(dim=0))
     ratios = drawn.add_(plan.flux).div_(limit).max(dim=1).values
-    return LinearDraws(variance.sqrt(), ratios.double().numpy())
+    return LinearDraws(sigma, ratios.double().numpy())
 
 
 _DENSE = 2**23
 """Mirrors, or twice as many draws, times pixels of a map whose changes are in memory at once."""
 
 
-def _changes(plan: AimPlan, axis: int, variance: Tensor) -> Tensor:
-    """What a standard deviation of the errors changes (N, P) [W/m2]; ``variance`` grows by it."""
-    changes = torch.zeros(len(plan.kernels), len(variance))
+def _changes(plan: AimPlan, axis: int) -> Tensor:
+    """What a standard deviation of the errors changes (N, P) [W/m2]."""
+    changes = torch.zeros(len(plan.kernels), len(plan.kernels.areas))
     with torch.no_grad():
         for part, rows in plan.kernels.parts():
             moved, shift = plan.moved[rows], part.spread[:, :, axis] / 2
             change = part.light(moved + shift) - part.light(moved - shift)
             change *= plan.is_active[rows, None]
-            variance.copy_(part.add_to(variance, change**2))
-            if part.is_whole:
-                changes[rows] = change
-            else:
-                changes[rows].scatter_add_(1, part.pixels.long(), change)
+            changes[rows].scatter_add_(1, part.pixels.long(), change)
     return changes
 
 

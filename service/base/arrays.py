@@ -16,7 +16,7 @@ from model.errors import InvalidInputError
 def pack(arrays: Mapping[str, NDArray[np.generic]]) -> bytes:
     """Compress named arrays to npz. Equal arrays give equal bytes."""
     buffer = io.BytesIO()
-    # numpy's own function compresses twice as long, for 5 % fewer bytes.
+    # As `numpy.savez_compressed`, at the fastest level: noise in images leaves little to compress.
     with ZipFile(buffer, "w", ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as member:

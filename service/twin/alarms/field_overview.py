@@ -266,26 +266,24 @@ def read_summaries(session: Session, heliostat: int | None = None) -> list[Helio
     receivers = [store.stored_receiver(row).center for row in store.list_receivers(session)]
     states = _states(session, heliostat)
     row, none = HeliostatRow, _PhotographCounts()
-    dates, place = (row.photographs_changed_at, row.updated_at), (row.east_m, row.north_m, row.up_m)
-    query = select(row.id, row.name, *dates, *place).order_by(row.name)
+    dates, enu = (row.photographs_changed_at, row.updated_at), (row.east_m, row.north_m, row.up_m)
+    query = select(row.id, row.name, *dates, *enu)
     if heliostat is not None:
         query = query.where(row.id == heliostat)
     lines = []
-    for number, name, changed, updated_at, east, north, up in session.execute(query):
+    for number, name, changed, updated_at, *place in session.execute(query.order_by(row.name)):
         taken, mount = photographs.get(number, none), mounted.get(number)
         corrected = max((at for at in (taken.corrected, changed) if at is not None), default=None)
         line = HeliostatOverview(
             name,
-            east,
-            north,
+            place[0],
+            place[1],
             taken.photographs,
             taken.refused,
             taken.used,
             corrected,
             surfaces.get(number),
-            range_m=min(
-                (math.dist((east, north, up), center) for center in receivers), default=None
-            ),
+            range_m=min((math.dist(place, center) for center in receivers), default=None),
             mounted=None
             if mount is None
             else MountKey(name, *mount, taken.newest, corrected, model),

@@ -67,10 +67,12 @@ def end_session(runtime: Runtime, request: Request, response: Response) -> None:
     response.delete_cookie(security.COOKIE, httponly=True, samesite="strict")
 
 
-_EMPTY = status.HTTP_204_NO_CONTENT
-
-
-@router.post("/session", status_code=_EMPTY, response_class=Response, responses=problems(401))
+@router.post(
+    "/session",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(401),
+)
 def post_session(
     key: Annotated[
         Text, Form(max_length=200, description="A key made by `heliotwin keys create`.")
@@ -88,7 +90,12 @@ def post_session(
     keep_session(response, request, token)
 
 
-@router.delete("/session", status_code=_EMPTY, response_class=Response, responses=problems())
+@router.delete(
+    "/session",
+    status_code=status.HTTP_204_NO_CONTENT,
+    response_class=Response,
+    responses=problems(),
+)
 def delete_session(request: Request, runtime: RuntimeDep, response: Response) -> None:
     """End the session. Copies of its cookie are no longer valid."""
     end_session(runtime, request, response)
